@@ -255,11 +255,11 @@ def against(other: str, presets: Sequence[str]) -> Callable[[Any], str]:
 
 
 def compared_row(name: str, part: Any, other: str, preset: str) -> tuple[str, ...]:
-    both = next((one for one in part.get('against', ())
-                 if (one['other'], one['preset']) == (other, preset)), None)
-    figures = ['–'] * 5 if both is None else [
-        estimated(both),
-        *(ratio(*both[what][kind]) for what in DIGITS for kind in ('mean', 'median'))]
+    comparison = next((one for one in part.get('against', ())
+                       if (one['other'], one['preset']) == (other, preset)), None)
+    figures = ['–'] * 5 if comparison is None else [
+        estimated(comparison),
+        *(ratio(*comparison[what][kind]) for what in DIGITS for kind in ('mean', 'median'))]
     return (name, preset, *figures,
             failures(find(part, 'djet', preset), find(part, other, preset)))
 
@@ -285,16 +285,16 @@ def table_1(results: Any) -> str:
         if name not in TABLE_1:
             continue
         printed = {row.method: row for row in TABLE_1[name]}
-        here = {method: find(part, method, 'paper') or {} for method in OURS}
+        measured = {method: find(part, method, 'paper') or {} for method in OURS}
         rows += [(name, f'here, {pairs(part)} pairs',
-                  *(number(one.get('rotation', {}).get('mean')) for one in here.values()),
-                  *(number(one.get('direction', {}).get('mean')) for one in here.values()),
-                  *(number(here[method].get('hamming'), 2) for method in PRINTED_HAMMING)),
+                  *(number(one.get('rotation', {}).get('mean')) for one in measured.values()),
+                  *(number(one.get('direction', {}).get('mean')) for one in measured.values()),
+                  *(number(measured[method].get('hamming'), 2) for method in PRINTED_HAMMING)),
                  (name, 'the paper', *(number(printed[method].rotation_deg) for method in OURS),
                   *(number(printed[method].translation_deg) for method in OURS),
                   *(number(printed[method].hamming, 2) for method in PRINTED_HAMMING))]
-        if here['five_point']:
-            starts.append(f'{pair_of(here["five_point"], "mean")} here and '
+        if measured['five_point']:
+            starts.append(f'{pair_of(measured["five_point"], "mean")} here and '
                           f'{printed["five_point"].rotation_deg:.3f} / '
                           f'{printed["five_point"].translation_deg:.3f} there on {name}')
     said = ("The paper's Table 1 (whole sequences, units as printed: degrees) next to the preset "
@@ -459,11 +459,11 @@ def verdict(part: Any) -> str:
     changed = [one for one in part['variants'] if one['method'] == 'djet' and one['change']]
     if not all('ratio' in one for one in changed):
         return 'Significance of these differences was not measured yet.'
-    said: dict[str, list[str]] = {}
+    by_verdict: dict[str, list[str]] = {}
     for one in changed:
-        said.setdefault(judged(one['ratio']), []).append(one['change'])
-    return 'By the means: ' + ' '.join(f'{word}: {"; ".join(said[word])}.'
-                                       for word in JUDGED if word in said)
+        by_verdict.setdefault(judged(one['ratio']), []).append(one['change'])
+    return 'Significance of the means of both errors. ' + ' '.join(
+        f'{word}: {"; ".join(by_verdict[word])}.' for word in JUDGED if word in by_verdict)
 
 
 JUDGED = (
@@ -487,26 +487,26 @@ def judged(ratio: Any) -> str:
 def joined(results: Any) -> str:
     """Return the comparison of surfaces and photometric alignment, together and alone."""
     part = results['parts'].get('ablation')
-    ways = (('djet', ''), ('djet', 'surfaces alone'), ('rpe', ON_PLACES), ('rpe', WEIGHED),
-            ('rpe', ''))
+    variants = (('djet', ''), ('djet', 'surfaces alone'), ('rpe', ON_PLACES), ('rpe', WEIGHED),
+                ('rpe', ''))
     found = {(one['method'], one['change']): one for one in part['variants']} if part else {}
     if ('rpe', WEIGHED) not in found:
         return 'Surfaces and photometric alignment alone were not measured yet.\n'
     return (paragraph(f'On {found["djet", ""]["pairs"]} rendered pairs, those of the "Ablation" '
-                      'below:') + table(VARIANTS, (variant(found[way]) for way in ways)))
+                      'below:') + table(VARIANTS, (variant(found[key]) for key in variants)))
 
 
 def speed(results: Any) -> str:
     part = results['parts'].get('speed')
     if part is None:
         return 'Not measured yet.\n'
-    both = (part, part['all_cores'])
+    runs = (part, part['all_cores'])
     rows = [("time relative to OpenCV's pipeline",
-             *(f'{one["pipeline_over_opencv"]:.2f}' for one in both)),
-            ('the same, preset `fast`', *(f'{one["fast_over_opencv"]:.2f}' for one in both)),
-            ('pairs per second', *(f'{one["pairs_per_second"]:.1f}' for one in both)),
-            ('the same, preset `fast`', *(f'{one["fast_pairs_per_second"]:.1f}' for one in both)),
-            *((f'{stage}, ms', *(f'{one["stages_ms"][stage]:.1f}' for one in both))
+             *(f'{one["pipeline_over_opencv"]:.2f}' for one in runs)),
+            ('the same, preset `fast`', *(f'{one["fast_over_opencv"]:.2f}' for one in runs)),
+            ('pairs per second', *(f'{one["pairs_per_second"]:.1f}' for one in runs)),
+            ('the same, preset `fast`', *(f'{one["fast_pairs_per_second"]:.1f}' for one in runs)),
+            *((f'{stage}, ms', *(f'{one["stages_ms"][stage]:.1f}' for one in runs))
               for stage in part['stages_ms'])]
     growth = [(f'{name} {key}', f'{value:.1f}')
               for name, by in (('matches:', 'djet_ms_by_points'), ('window:', 'djet_ms_by_window'))

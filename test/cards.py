@@ -11,7 +11,7 @@ REST = np.eye(4)
 
 
 class Cards:
-    """Cards facing the camera at rest, each with holes through which the next one is seen."""
+    """Cards that face the initial camera, each with holes that show the next one."""
 
     def __init__(self, seed: int = 5) -> None:
         rng = np.random.default_rng(seed)
@@ -30,7 +30,7 @@ class Cards:
                                  [0, 0, 1]])
 
     def gray(self, pose: np.ndarray = REST, noise: int | None = None) -> np.ndarray:
-        """See the cards from a pose (4, 4), camera in the world; noise is a seed."""
+        """Render the cards from a pose (4, 4), camera in the world; noise: a seed."""
         R, t = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
         image = np.zeros(SIZE[::-1], np.float32)
         for depth, texture, mask in self._cards:
@@ -42,7 +42,7 @@ class Cards:
         return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
     def frame(self, seconds: float, pose: np.ndarray = REST, **more) -> Frame:
-        """See the cards as a frame."""
+        """Render the cards as a frame."""
         return Frame(self.gray(pose, **more), K, round(seconds * 1e9), 'camera')
 
 

@@ -1,4 +1,4 @@
-"""What several tests need: the real KITTI frames, and small sequences in KITTI's layout."""
+"""Fixtures of several tests: the real KITTI frames, and small sequences in KITTI's layout."""
 
 from collections.abc import Callable
 import os
@@ -11,13 +11,13 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def pytest_configure() -> None:
-    """Take one thread a process, before anything imports NumPy: tests run side by side."""
+    """Use one thread a process, set before NumPy is imported: tests run in parallel."""
     one_blas_thread()
 
 
 @pytest.fixture(scope='session')
 def kitti() -> Path:
-    """Folder with sequences/ and poses/ of real frames: in $DJET_DATA or beside the project."""
+    """Folder with sequences/ and poses/ of real frames: in $DJET_DATA or next to the project."""
     for data in (os.environ.get('DJET_DATA'), ROOT.parent / 'shared' / 'data'):
         if data and (Path(data) / 'kitti' / 'sequences').is_dir():
             return Path(data) / 'kitti'

@@ -1,4 +1,4 @@
-"""What each covariance in a message must be, whatever the images were."""
+"""Checks of the covariances in messages, for any images."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from djet_ros.odometry.result import OdometryResult
 import numpy as np
 from ros_messages import message_type
 
-# Beyond what is said of a motion that nobody knows.
+# Above the variances of an unknown motion.
 ABSURD = 1e12
 
 
 def check_messages(result: OdometryResult) -> None:
-    """Check all covariances of what is published of a frame: no zero, nothing infinite."""
+    """Check all covariances published for a frame: none is zero or infinite."""
     make = Messages(message_type, OdometryConfig())
     odometry = make.odometry(result)
     estimates = {'pose': odometry.pose, 'twist': odometry.twist}

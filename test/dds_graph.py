@@ -1,4 +1,4 @@
-"""A peer on a DDS graph of its own, and commands that run there as processes."""
+"""A peer on a separate DDS graph, and commands that run on it as processes."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ ENVIRONMENT = {
 
 
 class Peer:
-    """Hears what the odometry says, and publishes, in the process of the test."""
+    """Subscribes to the odometry, and publishes, in the process of the test."""
 
     def __init__(self) -> None:
         from djet_ros.dds.graph import Graph
@@ -57,13 +57,13 @@ class Peer:
 
     def advertise(self, topic: str, kind: str, profile: Profile = DEEP,
                   listeners: int = 1) -> Any:
-        """Publish from now on, and wait until so many listen."""
+        """Publish from now on, and wait for a number of subscriptions."""
         publisher = self.graph.advertise(topic, kind, profile)
         self.wait(f'a listener on {topic}', lambda: publisher.listeners >= listeners)
         return publisher
 
     def wait(self, what: str, condition: Callable[[], Any], seconds: float = PATIENCE) -> Any:
-        """Take messages until a condition holds, and give its value."""
+        """Take messages until a condition holds, and return its value."""
         end = monotonic() + seconds
         while not (value := condition()):
             counts = {topic: len(messages) for topic, messages in self.received.items()}
@@ -88,7 +88,7 @@ class Peer:
 
 
 class Command:
-    """A djet command in a process of its own; before: what its Python is to do first."""
+    """A djet command in another process; before: Python code to run first."""
 
     def __init__(self, log: Path, *arguments: str | Path, before: str = '') -> None:
         self.path = log
@@ -100,16 +100,16 @@ class Command:
 
     @property
     def log(self) -> str:
-        """Return what it has written so far."""
+        """Return its output so far."""
         return self.path.read_text()
 
     def finish(self) -> str:
-        """Wait for a good end, and give what was written."""
+        """Wait for exit code 0, and return the output."""
         assert self.process.wait(PATIENCE) == 0, self.log
         return self.log
 
     def end(self, number: int = signal.SIGINT) -> tuple[int, float]:
-        """Send a signal; gives the exit code and the seconds until the end."""
+        """Send a signal; returns the exit code and the seconds until the end."""
         start = monotonic()
         self.process.send_signal(number)
         code = self.process.wait(10)

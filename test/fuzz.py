@@ -1,5 +1,5 @@
 """
-Coverage-guided fuzzing of everything that reads what strangers made, for a bounded time.
+Coverage-guided fuzzing of all readers of foreign data, for a bounded time.
 
     python test/fuzz.py [--seconds N] [TARGET ...]     each target in turn, N seconds each
     python test/fuzz.py --input FILE TARGET            one input again, with its traceback
@@ -48,7 +48,7 @@ def main() -> int:
 
 
 def run(name: str, seconds: int) -> bool:
-    """Fuzz one target in a process of its own; tell whether it held."""
+    """Fuzz one target in another process; return whether it passed."""
     CORPUS.mkdir(exist_ok=True)
     log = CORPUS / f'{name}.log'
     with log.open('w') as output:
@@ -65,7 +65,7 @@ def run(name: str, seconds: int) -> bool:
 
 
 def fuzz(name: str, seconds: int) -> int:
-    """Let atheris think of inputs, in this process, which it ends."""
+    """Let atheris generate inputs, in this process, which it ends."""
     import atheris
     with atheris.instrument_imports(include=['djet_ros', 'rosbags', 'yaml']):
         import fuzz_targets

@@ -1,5 +1,5 @@
 """
-Everything that reads what strangers made, each as a function of bytes.
+All readers of foreign data, each as a function of bytes.
 
 A target takes any bytes. It gives them to the public functions that would read them, and lets
 nothing through but a good result and an error of ours, worded for a terminal. Whatever else comes
@@ -165,7 +165,7 @@ def info_seeds() -> list[bytes]:
 
 
 def absurd() -> Iterator[Any]:
-    """Say numbers that are finite, and no camera's."""
+    """Numbers that are finite, but not those of a camera."""
     for value in (1e300, 1e6, 1e-300):
         for at in ((0, 0), (0, 2), (0, 1)):
             matrix = K.copy()
@@ -409,7 +409,7 @@ class Sequence(NamedTuple):
 
 
 def check_sequence(sequence: FrameSequence, place: Path) -> None:
-    """Whatever a folder says, its sequence keeps what FrameSequence promises."""
+    """Check that the sequence of any folder keeps the contract of FrameSequence."""
     assert (np.diff(sequence.stamps_ns) > 0).all()
     assert np.isfinite(sequence.K).all()
     if sequence.poses is not None:
@@ -602,7 +602,7 @@ def trajectory_seeds() -> list[bytes]:
 
 
 def results_of(data: bytes) -> None:
-    """Read a results folder whose table of frames anybody may have edited."""
+    """Read a results folder whose table of frames may have been edited."""
     with folder() as place:
         for name, text in (('frames.csv', data), ('trajectory_tum.txt', TUM_OF_RESULTS),
                            ('config.yaml', dump_yaml(Config()).encode())):

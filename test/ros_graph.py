@@ -1,4 +1,4 @@
-"""Processes on a ROS graph of their own: the node under test, and peers that talk with it."""
+"""Processes on a separate ROS graph: the node under test, and its peers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ENVIRONMENT = {**os.environ, 'ROS_DOMAIN_ID': str(1 + os.getpid() % 100),
 
 
 def command(node: str, before: str = '') -> list[str]:
-    """Return the command that runs a node; before: what its Python is to do first."""
+    """Return the command that runs a node; before: Python code to run first."""
     return [sys.executable, '-c', f'{before}import sys; from djet_ros.cli.nodes import {node}; '
             f'sys.exit({node}())']
 
@@ -65,7 +65,7 @@ class Peer:
             self._changed.notify_all()
 
     def ask(self, do: str, **arguments: Any) -> Any:
-        """Have a function of the peer called, and give its answer."""
+        """Call a function of the peer, and return its answer."""
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps({'do': do, **arguments}) + '\n')
         self._process.stdin.flush()
@@ -77,7 +77,7 @@ class Peer:
         return said['answer']
 
     def advertise(self, topic: str, kind: str, listeners: int = 1, **qos: Any) -> None:
-        """Publish from now on, and wait until so many listen."""
+        """Publish from now on, and wait for a number of subscriptions."""
         self.ask('advertise', topic=topic, kind=kind, **qos)
         self.ask('matched', topic=topic, count=listeners)
 
@@ -92,7 +92,7 @@ class Peer:
 
     def wait(self, what: str, condition: Callable[[dict[str, list[Any]]], Any],
              seconds: float = PATIENCE) -> Any:
-        """Wait until a condition holds of what was heard, and give its value."""
+        """Wait until a condition of the received messages holds, and return its value."""
         with self._changed:
             value = self._changed.wait_for(lambda: condition(self.received), seconds)
             counts = {topic: len(messages) for topic, messages in self.received.items()}
@@ -105,7 +105,7 @@ class Peer:
         return self.ask('call', service=f'{node}/{service}', kind='std_srvs/srv/Trigger')
 
     def kill(self) -> None:
-        """End the process as a crash would."""
+        """Kill the process, as a crash would."""
         self._process.kill()
         self._process.wait()
 
@@ -122,11 +122,11 @@ class Peer:
 
 
 class NodeProcess:
-    """The node under test in a process of its own, with its log."""
+    """The node under test in another process, with its log."""
 
     def __init__(self, log: Path, ros_arguments: Sequence[str], parameters: Mapping[str, Any],
                  name: str = 'vo_node', before: str = '') -> None:
-        """Start it with words for ROS, such as remappings, and with parameters by name."""
+        """Start it with arguments for ROS, such as remappings, and with parameters by name."""
         self.path = log
         values = [word for name, value in parameters.items()
                   for word in ('-p', f'{name}:={json.dumps(value)}')]
@@ -137,11 +137,11 @@ class NodeProcess:
 
     @property
     def log(self) -> str:
-        """Return what the node has said so far."""
+        """Return the log of the node so far."""
         return self.path.read_text()
 
     def end(self, number: int = signal.SIGINT) -> tuple[int, float]:
-        """Send a signal; gives the exit code and the seconds until the end."""
+        """Send a signal; returns the exit code and the seconds until the end."""
         start = monotonic()
         self.process.send_signal(number)
         code = self.process.wait(10)

@@ -1,4 +1,4 @@
-"""Messages as cameras send them, made of rosbags' classes of ROS 2 Jazzy."""
+"""Messages of cameras, in the classes of rosbags for ROS 2 Jazzy."""
 
 import numpy as np
 from rosbags.typesys import get_typestore, Stores

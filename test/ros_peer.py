@@ -1,5 +1,5 @@
 """
-A process on the ROS graph that publishes, subscribes and calls as its standard input says.
+A process on the ROS graph that publishes, subscribes and calls on request by standard input.
 
 Each line in is a JSON object with the name of a function in 'do' and its arguments; the answer
 is a line {"answer": ...}. What is heard comes as lines {"topic": ..., "data": ...}. Messages are
@@ -23,12 +23,12 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 
-# Beyond the lease that Fast DDS grants a participant whose leave was not heard.
+# Longer than the lease of a participant of Fast DDS that left without notice.
 PATIENCE = 45.0
 
 
 class Peer:
-    """The functions that can be asked for."""
+    """The functions that can be called."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -40,7 +40,7 @@ class Peer:
         self._publishers[topic] = self._node.create_publisher(ros_type(kind), topic, profile(qos))
 
     def matched(self, topic, count=1):
-        """Wait until so many listen."""
+        """Wait for a number of subscriptions."""
         self._until(lambda: self._publishers[topic].get_subscription_count() >= count)
 
     def alone(self, topic):
@@ -60,7 +60,7 @@ class Peer:
         self._node.destroy_subscription(self._subscriptions.pop(topic))
 
     def published(self, topic, count=1):
-        """Wait until so many publish."""
+        """Wait for a number of publishers."""
         self._until(lambda: self._node.count_publishers(topic) == count)
 
     def call(self, service, kind):
@@ -70,7 +70,7 @@ class Peer:
         return {name: getattr(answer, name) for name in answer.get_fields_and_field_types()}
 
     def configure(self, node, values):
-        """Set parameters one by one; gives for each (successful, reason)."""
+        """Set parameters one by one; returns (successful, reason) for each."""
         client = AsyncParameterClient(self._node, node)
         assert client.wait_for_services(PATIENCE), f'no parameters of {node}'
         answer = self._result(client.set_parameters(

@@ -1,4 +1,4 @@
-"""Variants of D-JET: each is what it says, and is called better only where pairs tell it."""
+"""Variants of D-JET: each has its stated change, and is called better only if pairs show it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def road(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return dataset
 
 
-def test_steps_of_a_share_of_the_way_are_not_taken_for_rest(road):
+def test_steps_by_a_share_of_the_distance_are_not_convergence(road):
     variants = [method for method in ablation_methods(['best'], ['step'], (), {})
                 if method.change.startswith('step')]
     assert [method.config.step for method in variants] == ['pixel', *['share'] * 3]
@@ -34,11 +34,11 @@ def test_steps_of_a_share_of_the_way_are_not_taken_for_rest(road):
         rounds = []
         estimator = TwoViewEstimator(method.config)
         estimator.estimate_matched(*views, *estimator.match(*views), observe=rounds.append)
-        # Who goes a tenth of the way has gone nine tenths of it after 20 rounds only.
+        # By steps of a tenth of the distance, nine tenths take more than 20 rounds.
         assert len(rounds) == 20, method.change
 
 
-def test_reprojection_error_stands_beside_on_the_places_by_gray_levels(road):
+def test_reprojection_error_is_also_compared_at_photometric_positions(road):
     methods = ablation_methods(['best'], ['joining'], (), {})
     assert [(method.name, method.change) for method in methods] == [
         ('djet', ''), ('rpe', ''), ('five_point', ''), ('djet', 'surfaces alone'),
@@ -69,7 +69,7 @@ def variant(change: str, rotation: list[float], direction: list[float],
                 'direction': {'mean': direction, 'median': [1.0, 0.9, 1.1]}}}
 
 
-def test_the_page_calls_worse_or_better_only_what_the_intervals_tell():
+def test_the_page_calls_worse_or_better_only_what_the_intervals_exclude():
     page = pages()
     part = {'of': ['road'], 'frames': 7, 'seeds': [0], 'variants': [
         variant('', [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]),
@@ -82,9 +82,9 @@ def test_the_page_calls_worse_or_better_only_what_the_intervals_tell():
         variant('', [3.0, 2.0, 4.0], [2.0, 1.5, 3.0], 'rpe')]}
     verdict_text = page.verdict(part)
     assert verdict_text == (
-        'By the means: Worse in both: squares. Worse in one, not significant in the other: alone. '
-        'Better in one, not significant in the other: slow. Not significant (both intervals '
-        'contain 1): wide.')
+        'Significance of the means of both errors. Worse in both: squares. '
+        'Worse in one, not significant in the other: alone. Better in one, not significant in the '
+        'other: slow. Not significant (both intervals contain 1): wide.')
     part['variants'].append(variant('surfaces alone', [1.3, 1.1, 1.5], [1.4, 1.2, 1.6]))
     joined = page.joined({'parts': {'ablation': part}})
     assert f'| RP-E | {ON_PLACES} |' in joined and '1.20 (0.90 to 1.50)' in joined
@@ -106,7 +106,7 @@ def test_scenes_without_parallax_have_no_direction_in_the_readme():
     assert {'rotation', 'standstill', 'traffic'} == pages().WITHOUT_TRANSLATION
 
 
-def test_a_ratio_has_one_inside_its_interval_as_often_as_equals_are_compared():
+def test_the_interval_of_a_ratio_of_equals_contains_one_as_often_as_claimed():
     rng = np.random.default_rng(0)
     inside = 0
     for _ in range(300):
@@ -118,7 +118,7 @@ def test_a_ratio_has_one_inside_its_interval_as_often_as_equals_are_compared():
     assert 0.88 < inside / 300 < 0.99
 
 
-def test_what_is_better_pair_by_pair_is_told_although_pairs_differ_more():
+def test_a_small_gain_in_each_pair_is_significant_although_pairs_differ_more():
     base = np.random.default_rng(1).chisquare(1, 60)
     better = ratio_of(0.9 * base, base)
     assert better.value == pytest.approx(0.9) and better.significant

@@ -126,7 +126,7 @@ def test_the_imu_offset_corrects_the_clock_of_a_gyro(drive: Drive) -> None:
 
 
 def test_a_gyro_continues_the_orientation_through_darkness() -> None:
-    """A camera stands for three seconds, starts, and sees nothing for another two."""
+    """A camera is stationary for three seconds, starts, and has black images for another two."""
     drive, dark = Drive(frames=30, standing=30), tuple(range(36, 56))
     one = tracker(**IMU)
     angles = {}
@@ -365,7 +365,7 @@ def test_a_single_pixel_blocks_the_patches_around_it() -> None:
 @pytest.mark.parametrize('kind', ['file', 'topic'])
 def test_masked_pixels_have_no_influence(drive: Drive, kind: str) -> None:
     """
-    The lower half sticks to the camera, as its own bonnet would, or is as it was.
+    The lower half is attached to the camera, as a bonnet would be, or unchanged.
 
     What is left has the whole width, which tells a turn to the side from a way to the side. (The
     right half alone would not: pictures of a few planes so narrow fit two motions.)

@@ -1,4 +1,4 @@
-"""Bags: what is written reads back, and what is broken is read as far as it goes."""
+"""Bags are read back as written, and damaged ones as far as possible."""
 
 from collections import Counter
 import os
@@ -259,7 +259,7 @@ def lose_the_metadata(folder):
 
 @pytest.mark.parametrize('change', [keep_notes, keep_a_recording, keep_a_folder, rename_the_file,
                                     link_to_the_file, lose_the_metadata])
-def test_a_folder_that_holds_anything_but_a_bag_of_ours_is_never_overwritten(
+def test_a_folder_with_anything_but_an_output_bag_is_never_overwritten(
         small_kitti, tmp_path, change):
     sequence = KittiSequence(small_kitti(frames=2))
     write_kitti_bag(sequence, tmp_path / 'out')
@@ -669,8 +669,8 @@ def test_a_compressed_file_cut_short_gives_its_first_messages(tmp_path):
     assert not list(Path(os.environ.get('TMPDIR', '/tmp')).glob('djet-*/bag.mcap*'))
 
 
-def test_of_a_bag_compressed_file_by_file_one_file_at_a_time_is_unpacked(tmp_path, monkeypatch):
-    """Each pass reads all of it, and so do two at once."""
+def test_a_bag_compressed_by_file_is_unpacked_one_file_at_a_time(tmp_path, monkeypatch):
+    """Each pass reads the whole bag, and so do two at once."""
     (tmp_path / 'scratch').mkdir()
     monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path / 'scratch'))
     bag = tmp_path / 'bag'

@@ -1,4 +1,4 @@
-"""The bench writes the figures that it promises, and refuses what it can't measure."""
+"""The bench writes the documented figures, and refuses what it can't measure."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def output(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_the_figures_are_positive_ratios_and_times_and_the_plot_is_there(output):
+def test_figures_are_positive_ratios_and_times_and_the_plot_exists(output):
     figures = json.loads(output.read_text())
     for name in ('pipeline_over_opencv', 'pairs_per_second', 'djet_stage_ms',
                  'kernel_speedup_over_cv2', 'bytes_per_frame'):
@@ -45,7 +45,7 @@ def test_the_figures_are_positive_ratios_and_times_and_the_plot_is_there(output)
     assert output.with_suffix('.png').read_bytes().startswith(b'\x89PNG')
 
 
-def test_repeats_are_made_in_turn_and_the_least_of_each_counts():
+def test_repeats_alternate_and_the_least_time_of_each_counts():
     order, times = [], iter(range(100, 0, -1))
 
     def noted(name):
@@ -59,7 +59,7 @@ def test_repeats_are_made_in_turn_and_the_least_of_each_counts():
     assert least == {'a': 103.0 - len(order), 'b': 102.0 - len(order), 'c': 101.0 - len(order)}
 
 
-def test_no_stage_is_negative_and_with_the_rest_they_are_the_time_of_a_pair(output):
+def test_stages_are_positive_and_add_up_to_the_time_of_a_pair(output):
     figures = json.loads(output.read_text())
     for run in (figures, figures['all_cores']):
         # "decode + features" is what the others leave, which they must not exceed.
@@ -82,7 +82,7 @@ def test_a_bag_is_measured_like_the_folder_that_it_was_made_of(sequence, output,
 @pytest.mark.parametrize(('arguments', 'message'), [
     (('missing', '--output', 'a.json'), 'missing'),
     (('.', '--output', 'a.json', '--pairs', 0), '--pairs is 0')])
-def test_what_can_be_mended_is_one_line_and_exit_code_2(tmp_path, arguments, message, monkeypatch):
+def test_user_errors_are_one_line_and_exit_code_2(tmp_path, arguments, message, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = bench(*arguments)
     assert run.returncode == 2

@@ -23,7 +23,7 @@ K = np.array([[500.0, 0, 320], [0, 480, 240], [0, 0, 1]])
 
 
 def scene(rng, frames=4, landmarks=40, k1=0.05):
-    """Poses of a camera that drives and turns, and landmarks that it sees exactly, through k1."""
+    """Poses of a camera that drives and turns, and exact observations of landmarks through k1."""
     poses = Poses(
         np.array([rotation_exp(np.array([0.01, 0.03, -0.02]) * f) for f in range(frames)]),
         np.array([[0.1, -0.05, -0.4]]) * np.arange(frames)[:, None], k1)

@@ -1,4 +1,4 @@
-"""Whole chains of other libraries: they find exact motion, by themselves and in ``evaluate``."""
+"""Complete pipelines of other libraries: they find exact motion, alone and in ``evaluate``."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_descriptors_are_roots_of_histograms_and_neighbours_mutual(street: Scene
     assert len(both) > 0.8 * len(x)
 
 
-def test_a_corner_that_does_not_come_back_is_dropped(street: ScenePair) -> None:
+def test_a_corner_that_is_not_tracked_back_is_dropped(street: ScenePair) -> None:
     x, _ = tracked(corners(street.previous), corners(street.previous))
     assert len(x) == len(corners(street.previous).places)
     other = np.ascontiguousarray(np.rot90(street.current, 2))
@@ -128,7 +128,7 @@ def test_a_corner_that_does_not_come_back_is_dropped(street: ScenePair) -> None:
     np.full((120, 160), 90, np.uint8),
     np.pad(np.full((20, 20), 200, np.uint8), 50),
 ], ids=['blank', 'one square'])
-def test_an_image_without_points_is_told_and_nothing_raises(
+def test_an_image_without_points_is_a_failure_without_an_exception(
         name: str, gray: NDArray[np.uint8]) -> None:
     chain = CHAINS[name]
     found = chain.estimate(*[chain.detect(gray, None)] * 2, np.diag([100.0, 100, 1]))
@@ -148,7 +148,7 @@ def test_the_same_images_give_the_same_pose_to_the_last_bit(name: str, street: S
 # Peers on given matches
 
 @pytest.mark.parametrize('name', ['opencv_ransac', 'usac_magsac'])
-def test_points_of_many_baselines_away_tell_opencvs_poses_apart(name: str) -> None:
+def test_points_many_baselines_away_distinguish_the_poses_of_opencv(name: str) -> None:
     # As a hand moves a camera by a centimetre, through a room of some metres.
     given = two_views(np.random.default_rng(0), t=FORWARD, near=60.0, far=300.0)
     R, t, _ = ESTIMATORS[name](given.K, given.x, given.y, 1.0)
@@ -167,7 +167,7 @@ def records(tmp_path_factory: pytest.TempPathFactory) -> list[PairRecord]:
     return evaluate_chunk(PairChunk(dataset, 0, 3), competing)
 
 
-def test_chains_bring_matches_and_milliseconds_of_their_own(records: list[PairRecord]) -> None:
+def test_chains_have_their_own_matches_and_times(records: list[PairRecord]) -> None:
     for pair in range(3):
         matches = {r.method: r.matches for r in records
                    if r.pair == pair and r.preset == 'best'}
@@ -179,7 +179,7 @@ def test_chains_bring_matches_and_milliseconds_of_their_own(records: list[PairRe
     assert len({row['milliseconds'] for row in table if row['method'] == 'klt_poselib'}) == 3
 
 
-def test_a_chain_is_the_same_beside_either_preset(records: list[PairRecord]) -> None:
+def test_a_chain_is_the_same_with_either_preset(records: list[PairRecord]) -> None:
     for name in NAMES:
         best, paper = ([(r.rotation, r.translation, r.matches, r.milliseconds) for r in records
                         if r.method == name and r.preset == preset]
@@ -187,7 +187,7 @@ def test_a_chain_is_the_same_beside_either_preset(records: list[PairRecord]) -> 
         assert best == paper
 
 
-def test_chains_are_right_and_their_descriptors_are_told(records: list[PairRecord]) -> None:
+def test_chains_find_the_pose_and_report_their_descriptors(records: list[PairRecord]) -> None:
     for found in (r for r in records if r.method in NAMES):
         assert not found.failed
         assert found.rotation_error_deg < 0.2
@@ -196,8 +196,8 @@ def test_chains_are_right_and_their_descriptors_are_told(records: list[PairRecor
         assert 20 < found.inliers <= found.matches
 
 
-def test_a_chain_alone_does_not_need_our_features(monkeypatch: pytest.MonkeyPatch,
-                                                  tmp_path: Path) -> None:
+def test_a_chain_alone_detects_no_features_of_djet(
+        monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     folder = render_sequence('road', tmp_path, 2, size=(480, 160))
     dataset, = open_datasets([folder], Selection(), tmp_path)
 
@@ -216,7 +216,7 @@ def test_every_method_has_a_colour_and_a_dash_of_its_own() -> None:
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_without_poselib_it_says_in_one_line_what_to_install(
+def test_a_missing_poselib_is_one_line_that_names_what_to_install(
         name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     # As Python does for a module that is not there.
     monkeypatch.setitem(sys.modules, 'poselib', None)

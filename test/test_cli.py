@@ -1,4 +1,4 @@
-"""The frame of the ``djet`` command, in real processes."""
+"""The ``djet`` command in real processes: help, errors, signals."""
 
 from __future__ import annotations
 
@@ -74,8 +74,8 @@ def test_every_command_has_help(command: str) -> None:
 
 
 @pytest.mark.parametrize('command', [*COMMANDS, *(f'lab {verb}' for verb in LAB)])
-def test_help_comes_where_only_ascii_can_be_shown(command: str,
-                                                  monkeypatch: pytest.MonkeyPatch) -> None:
+def test_help_is_shown_where_only_ascii_is_possible(
+        command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv('PYTHONIOENCODING', 'ascii')
     answer = djet(*command.split(), '--help')
     assert (answer.returncode, answer.stderr) == (0, '')
@@ -124,7 +124,7 @@ def test_an_option_is_what_it_is_called_and_no_beginning_of_another(call: tuple[
      "djet: error: this command needs the Python module 'no_such_library', which is not "
      'installed: pip install no_such_library\n'),
 ])
-def test_what_the_user_can_mend_gives_one_line_and_exit_code_2(
+def test_user_errors_give_one_line_and_exit_code_2(
         body: str, code: int, line: str) -> None:
     probe = start_probe(body)
     assert probe.communicate(timeout=60) == ('', line)
@@ -148,7 +148,7 @@ def test_a_file_of_parameters_for_others_alone_is_refused_by_every_command_that_
 
 
 @pytest.mark.parametrize('body', ["raise ValueError('a bug')", 'import djet_ros.no_such_module'])
-def test_what_only_we_can_mend_keeps_its_traceback(body: str) -> None:
+def test_an_internal_error_keeps_its_traceback(body: str) -> None:
     probe = start_probe(body)
     assert probe.communicate(timeout=60)[1].startswith('Traceback')
     assert probe.returncode == 1
@@ -168,7 +168,7 @@ def test_an_interrupt_gives_one_line_and_the_exit_code_of_a_shell(
 
 
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGHUP])
-def test_who_calls_the_command_from_python_keeps_the_handler(
+def test_a_call_from_python_keeps_its_signal_handler(
         tmp_path: Path, number: signal.Signals) -> None:
     before = signal.getsignal(number)
     assert main(['replay', str(tmp_path / 'absent'), '--output', str(tmp_path / 'out')]) == 2
@@ -199,7 +199,7 @@ def test_a_reader_that_leaves_early_is_no_error(body: str) -> None:
     assert probe.wait(timeout=60) == 141
 
 
-# Ends by itself, unless a signal waits for what it interrupted.
+# Ends, unless a signal handler waits for the call that it interrupted.
 SIGNALS = """
 import os, signal, time
 from threading import Thread

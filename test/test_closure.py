@@ -1,4 +1,4 @@
-"""Triangles of rotations: what remains, what was claimed, and the command that shows it."""
+"""Triangles of rotations: their closure error, its claimed size, and the command."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def motion(R: Rotation, sigma: float) -> RelativePose:
     return RelativePose(Status.OK, R.as_matrix(), covariance_5=sigma**2 * np.eye(5))
 
 
-def test_what_remains_is_the_error_of_the_three_and_as_large_as_claimed() -> None:
+def test_the_closure_error_is_that_of_three_pairs_and_as_large_as_claimed() -> None:
     rng = np.random.default_rng(0)
     squares = []
     for _ in range(300):
@@ -47,12 +47,12 @@ def test_what_remains_is_the_error_of_the_three_and_as_large_as_claimed() -> Non
     assert np.mean(squares) == pytest.approx(3, abs=4.5 * np.sqrt(6 / 300))
 
 
-def test_rotations_that_follow_from_one_another_leave_nothing() -> None:
+def test_consistent_rotations_have_no_closure_error() -> None:
     a, b = Rotation.from_euler('xyz', [[1, 2, 3], [-2, 1, 0.5]], degrees=True)
     assert np.allclose(closure_rotation(*(motion(R, 1e-3) for R in (a, b, b * a)))[0], 0)
 
 
-def test_what_remains_on_a_street_is_thousandths_of_a_degree_as_claimed(road: Path) -> None:
+def test_the_closure_error_on_a_street_is_thousandths_of_a_degree_as_claimed(road: Path) -> None:
     sequence = open_sequence(road)
     one = summary(closures(sequence, ['djet'], FRAMES)['djet'])
     assert one['triangles'] == FRAMES - 2 and one['without'] == 0
@@ -79,7 +79,7 @@ def test_the_command_writes_triangles_and_a_plot(road: Path, tmp_path: Path) -> 
 @pytest.mark.parametrize(('arguments', 'message'), [
     (('--frames', 2), '--frames is 2'), (('--methods', 'djet,poselib'), "'poselib'"),
     (('--output', '.'), 'is a folder')])
-def test_what_can_be_mended_is_one_line_and_exit_code_2(
+def test_user_errors_are_one_line_and_exit_code_2(
         road: Path, tmp_path: Path, arguments: tuple[object, ...], message: str) -> None:
     answer = djet(road, '--output', tmp_path / 'closure.json', *arguments)
     assert answer.returncode == 2

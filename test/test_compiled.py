@@ -61,7 +61,7 @@ PIXELS = 1e-3 if EXACT else 0.02
 
 @contextmanager
 def by_numpy() -> Iterator[None]:
-    """Do without what is compiled."""
+    """Use the NumPy implementations."""
     library, compiled.library = compiled.library, None
     try:
         yield
@@ -70,7 +70,7 @@ def by_numpy() -> Iterator[None]:
 
 
 def both(work: Callable[[], Result]) -> tuple[Result, Result]:
-    """Return what comes of it compiled, and by NumPy."""
+    """Return the results of a function compiled, and by NumPy."""
     done = work()
     with by_numpy():
         return done, work()
@@ -81,7 +81,7 @@ def image(seed: int, size: tuple[int, int] = (320, 200)) -> np.ndarray:
 
 
 def warps(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Give (N, 3, 2) as of a road that comes nearer, half of them in perspective."""
+    """Return the warps of a road that comes nearer, (N, 3, 2), half of them in perspective."""
     warp = np.tile(np.eye(3, 2), (count, 1, 1))
     warp[:, :2] += rng.normal(0, 0.06, (count, 2, 2))
     warp[::2, 2] = rng.normal(0, 0.004, (len(warp[::2]), 2))
@@ -94,7 +94,7 @@ def loss(request: pytest.FixtureRequest) -> Loss:
 
 
 def problem(rng: np.random.Generator, count: int, indefinite: bool) -> tuple[JetProblem, Pose]:
-    """Give matches of two views, a fifth of them false, and a pose next to theirs."""
+    """Return matches of two views, a fifth of them false, and a pose close to theirs."""
     views = two_views(rng, count)
     y = views.y + rng.normal(0, 0.2, views.y.shape)
     y[::5] += rng.normal(0, 9, (len(y[::5]), 2))
@@ -378,7 +378,7 @@ def motions(frames: list[Frame], name: str) -> list[OdometryResult]:
 
 
 def apart_by(one: OdometryResult, other: OdometryResult) -> float:
-    """Tell how many standard deviations two motions are apart, at most in any direction."""
+    """Return by how many standard deviations two motions differ, at most in any direction."""
     off = np.linalg.inv(other.motion) @ one.motion
     step = np.concatenate([off[:3, 3], rotation_log(off[:3, :3])])
     return float(np.sqrt(step @ np.linalg.solve(other.motion_covariance, step)))

@@ -1,4 +1,4 @@
-"""Covariances against errors: what shares mean, and the command that shows them."""
+"""Covariances compared with errors: the shares within bounds, and the command."""
 
 from __future__ import annotations
 
@@ -64,18 +64,18 @@ def off_by(degrees: float, claimed: float = 0.05) -> float:
 
 
 @pytest.mark.parametrize('degrees', [0.05, 1.0, 45.0, 90.0, 135.0, 179.9, 180.0])
-def test_a_direction_is_as_far_off_as_its_angle_says(degrees: float) -> None:
+def test_the_error_of_a_direction_is_its_angle(degrees: float) -> None:
     assert off_by(degrees) == pytest.approx((degrees / 0.05)**2, rel=1e-6)
 
 
-def test_a_direction_that_is_sure_and_points_backwards_lies_in_no_ellipsoid() -> None:
+def test_a_certain_direction_that_points_backwards_is_outside_its_ellipsoid() -> None:
     flipped = record(square=off_by(180.0), failed=True)
     row, = coverage_rows([flipped])
     assert flipped.overconfident and row.failed == 1
     assert all(share == 0 for share, _, _ in row.inside)
 
 
-def test_the_bounds_of_a_share_hold_it_with_the_confidence_that_they_claim() -> None:
+def test_the_bounds_of_a_share_contain_it_with_the_claimed_confidence() -> None:
     tries = 60
     for true in (0.02, 0.5, 0.95):
         hits = np.arange(tries + 1)
@@ -84,7 +84,7 @@ def test_the_bounds_of_a_share_hold_it_with_the_confidence_that_they_claim() -> 
         assert binom.pmf(hits, tries, true)[held].sum() >= 0.95
 
 
-def test_only_what_is_wrong_and_claims_to_be_exact_is_both() -> None:
+def test_only_a_wrong_pose_that_claims_to_be_exact_is_wrong_and_certain() -> None:
     assert record(failed=True).overconfident
     for humble in (record(failed=False), record(failed=True, claims=(0.5, 1.0)),
                    record(failed=True, claims=(0.1, 5.0)),
@@ -102,7 +102,7 @@ def test_pairs_are_summed_up_by_scene() -> None:
     assert rows[1].inside[-1][0] == 0
 
 
-def test_a_motion_that_was_taken_for_none_is_counted() -> None:
+def test_a_motion_taken_for_a_standstill_is_counted() -> None:
     nan = float('nan')
     stood = record(square=nan, status=Status.NO_PARALLAX)
     moved = record(square=nan, status=Status.NO_PARALLAX, failed=True)
@@ -111,7 +111,7 @@ def test_a_motion_that_was_taken_for_none_is_counted() -> None:
     assert (row.pairs, row.told, row.failed, row.untold, row.given_up) == (4, 1, 1, 1, 1)
 
 
-def test_a_recorded_table_shows_what_was_untold_and_a_dash_where_that_was_not_counted(
+def test_a_recorded_table_shows_unreported_errors_or_a_dash_if_they_were_not_counted(
         tmp_path: Path) -> None:
     nan = float('nan')
     rows = [asdict(row) for row in coverage_rows([
@@ -134,7 +134,7 @@ def recorder() -> ModuleType:
 
 
 @pytest.mark.slow
-def test_the_command_renders_measures_and_takes_up_where_it_ended(tmp_path: Path) -> None:
+def test_the_command_renders_measures_and_resumes(tmp_path: Path) -> None:
     command = ('--scenes', 'road', '--seeds', '1', '--frames', 4, '--output', tmp_path,
                '--workers', 1)
     answer = djet(*command)
@@ -157,7 +157,7 @@ def test_the_command_renders_measures_and_takes_up_where_it_ended(tmp_path: Path
     (('--scenes', 'road', '--seeds', 'x'), "'x'"),
     (('--scenes', 'road', '--seeds', '5-3'), "'5-3'"),
     (('--scenes', 'road', '--frames', 1), '--frames is 1'), (('nowhere',), 'nowhere')])
-def test_what_can_be_mended_is_one_line_and_exit_code_2(
+def test_user_errors_are_one_line_and_exit_code_2(
         tmp_path: Path, arguments: tuple[object, ...], message: str) -> None:
     answer = djet(*arguments, '--output', tmp_path)
     assert answer.returncode == 2

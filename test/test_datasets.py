@@ -1,4 +1,4 @@
-"""TUM RGB-D and EuRoC folders, and finding out what a path holds."""
+"""TUM RGB-D and EuRoC folders, and the detection of layouts."""
 
 import cv2
 from djet_ros.errors import DjetError
@@ -108,7 +108,7 @@ def pincushion(folder, gray):
 
 
 def test_no_black_rim_moves_with_the_camera(asl):
-    """What a lens did not see is no edge in the rectified image."""
+    """Pixels beyond the raw image are no edge in the rectified image."""
     texture = np.random.default_rng(0).integers(100, 256, SIZE[::-1], np.uint8)
     pincushion(asl, texture)
     rectified = euroc(asl).image(2)
@@ -129,7 +129,7 @@ def test_a_distorted_sequence_is_replayed_as_its_raw_images_with_their_distortio
     assert np.array_equal(camera.undistort(texture), euroc(asl).image(2))
 
 
-def test_files_of_16_bits_are_replayed_with_all_of_them(asl):
+def test_files_of_16_bits_are_replayed_at_full_depth(asl):
     values = np.random.default_rng(0).integers(0, 4096, SIZE[::-1], np.uint16)
     pincushion(asl, values)
     recording = open_recording(asl)
@@ -180,7 +180,7 @@ def test_a_file_of_poses_of_either_form_serves_a_folder_of_either_layout(
     stamps, found = poses_of(tum, tmp_path / 'rows.txt')
     assert stamps.tolist() == tum_rgbd(tum).stamps_ns.tolist()
     assert np.allclose(found[:, 2, 3], 0.5 * np.arange(40))
-    # What lies beside a sequence may be of others.
+    # Files next to a sequence may belong to others.
     (kitti / '../../poses/07.txt').write_text(rows * 2)
     stamps, found = poses_of(kitti, tum / 'groundtruth.txt')
     assert len(stamps) == 140
@@ -203,18 +203,18 @@ def test_a_gap_in_the_ground_truth_is_not_bridged():
     assert from_first(nowhere) is None
 
 
-def test_a_calibration_file_goes_before_the_folders_name(tum):
+def test_a_calibration_file_precedes_the_name_of_the_folder(tum):
     (tum / 'calibration.txt').write_text('# fx fy cx cy\n100 101 80 60\n')
     assert tum_rgbd(tum).K.tolist() == [[100, 0, 80], [0, 101, 60], [0, 0, 1]]
 
 
-def test_an_unknown_camera_asks_for_its_calibration(tum):
+def test_an_unknown_camera_requires_a_calibration_file(tum):
     unknown = tum.rename(tum.with_name('kitchen'))
     with pytest.raises(DjetError, match=r"no known camera; write 'fx fy cx cy'.*calibration.txt"):
         tum_rgbd(unknown)
 
 
-def test_a_path_is_opened_as_what_it_holds(asl, tum, small_kitti, tmp_path):
+def test_a_path_is_opened_by_its_contents(asl, tum, small_kitti, tmp_path):
     folder = small_kitti()
     write_kitti_bag(KittiSequence(folder), tmp_path / 'bag')
     assert open_sequence(asl).name == 'MH_01'

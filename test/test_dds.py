@@ -313,7 +313,7 @@ def test_request_from_another_middleware_is_logged_and_ignored(live, peer):
     assert not peer.diagnostics(message='paused')
 
 
-def test_services_are_absent_to_fast_dds_clients_and_the_log_says_why(live, peer):
+def test_services_are_absent_to_fast_dds_clients_and_the_log_explains_it(live, peer):
     one = live(*FAST)
     writers, readers = ends(peer, f'{NODE}/reset')
     # rmw_fastrtps waits until there are as many of either

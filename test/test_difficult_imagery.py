@@ -183,7 +183,7 @@ KINDS: dict[str, Callable[[], Iterator[Outcome]]] = {
 }
 
 
-def test_every_kind_has_a_stated_outcome_and_the_other_way_round():
+def test_every_kind_has_a_stated_outcome_and_every_outcome_a_kind():
     assert list(stated()) == list(KINDS)
     assert all(outcome.statuses for outcome in stated().values())
 

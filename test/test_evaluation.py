@@ -104,7 +104,7 @@ def test_the_table_has_a_row_for_each_method_and_preset(evaluated):
     assert all(int(row['pairs']) == FRAMES - 1 for row in table)
 
 
-def test_the_best_preset_finds_exact_motion_to_a_hundredth_of_a_degree(evaluated):
+def test_the_preset_best_finds_exact_motion_to_a_hundredth_of_a_degree(evaluated):
     best, paper = ({row['method']: row for row in rows(evaluated / 'table1.csv')
                     if row['preset'] == preset} for preset in ('best', 'paper'))
     for method in ('djet', 'rpe', 'pjet'):
@@ -139,11 +139,11 @@ def test_tables_in_other_markups_hold_the_same_figures(evaluated):
         assert mean in (evaluated / name).read_text()
 
 
-def test_a_rendered_sequence_has_no_figures_of_the_paper_beside_it(evaluated):
+def test_a_rendered_sequence_is_not_compared_with_the_paper(evaluated):
     assert 'the paper' not in (evaluated / 'table1.md').read_text()
 
 
-def test_kitti_sequences_have_the_papers_figures_beside_them(kitti, tmp_path):
+def test_kitti_sequences_are_compared_with_the_paper(kitti, tmp_path):
     answer = djet('evaluate', kitti / 'sequences' / '06', '--end', '3', '--methods', 'djet,rpe',
                   '--presets', 'best', '--output', tmp_path)
     assert answer.returncode == 0, answer.stderr
@@ -152,7 +152,7 @@ def test_kitti_sequences_have_the_papers_figures_beside_them(kitti, tmp_path):
     assert {row['preset'] for row in rows(tmp_path / 'table1.csv')} == {'best'}
 
 
-def test_trajectories_stand_beside_the_ground_truth(road, evaluated):
+def test_trajectories_are_plotted_with_the_ground_truth(road, evaluated):
     folder = evaluated / 'trajectories' / 'road'
     stamps, truth = read_tum(folder / 'ground_truth.tum')
     assert np.allclose(truth, KittiSequence(road).poses, atol=1e-9)
@@ -176,7 +176,7 @@ def test_perfect_motions_make_the_true_trajectory(road, tmp_path):
     assert len(true_trajectory(source, records[:2] + records[3:]).poses) == 5
 
 
-def test_drift_is_told_of_ways_of_over_100_metres(road, tmp_path):
+def test_drift_is_reported_for_paths_over_100_metres(road, tmp_path):
     far = tmp_path / 'sequences' / 'far'
     shutil.copytree(road, far)
     (tmp_path / 'poses').mkdir()
@@ -186,7 +186,7 @@ def test_drift_is_told_of_ways_of_over_100_metres(road, tmp_path):
                   '--output', output)
     assert answer.returncode == 0, answer.stderr
     found = {row['method']: row for row in rows(output / 'drift.csv')}
-    # The name is the scene's, and the second one's is told apart.
+    # Both have the name of the scene, and the second one gets a suffix.
     assert {row['sequence'] for row in found.values()} == {'road-2'}
     assert set(found) == {'djet', 'five_point'}
     way = np.linalg.norm(np.diff(KittiSequence(far).poses[:, :3, 3], axis=0), axis=1).sum()
@@ -212,7 +212,7 @@ def write_stretched(poses: np.ndarray, times: float, path: Path) -> None:
     np.savetxt(path, stretched.reshape(-1, 12))
 
 
-def test_a_short_way_has_no_drift(evaluated):
+def test_a_short_path_has_no_drift(evaluated):
     assert rows(evaluated / 'drift.csv') == []
     assert 't_rel' not in (evaluated / 'index.html').read_text()
 
@@ -243,7 +243,7 @@ def test_rows_are_over_known_errors_and_count_the_failures():
 
 
 @pytest.mark.parametrize(('given_up', 'stressed'), [(False, ['D-JET']), (True, [])])
-def test_who_gives_up_what_is_hard_is_not_stressed_for_its_smaller_mean(given_up, stressed):
+def test_a_method_that_fails_on_hard_pairs_is_not_highlighted_for_its_mean(given_up, stressed):
     lost = {'rotation_error_deg': math.nan, 'failed': True} if given_up else {}
     table = results_table('', table_rows([
         record(0, rotation_error_deg=0.1), record(1, **{'rotation_error_deg': 0.2, **lost}),
@@ -263,7 +263,7 @@ def test_who_gives_up_what_is_hard_is_not_stressed_for_its_smaller_mean(given_up
     # A camera that stands has no direction to be missed.
     (0.5, math.nan, 0.0, False),
 ])
-def test_a_failure_is_what_it_is_said_to_be(rotation, translation, way, failed):
+def test_a_failure_is_an_error_above_the_stated_limit(rotation, translation, way, failed):
     motion = np.eye(4)
     motion[2, 3] = way
     assert has_failed(rotation, translation, motion) is failed
@@ -319,7 +319,7 @@ def test_a_bag_gives_the_errors_of_the_folder_that_it_was_made_of(road, tmp_path
     assert (bag['sequence'], folder['sequence']) == ('bag', 'road')
     assert float(bag['rotation_mean_deg']) == pytest.approx(
         float(folder['rotation_mean_deg']), abs=1e-4)
-    # The frames that were taken out of the bag are gone again.
+    # The frames extracted from the bag are removed again.
     assert not list((tmp_path / 'results').glob('.frames*'))
 
 
@@ -328,7 +328,7 @@ def test_frames_are_chosen_by_start_end_and_stride(road, tmp_path):
     assert list(source.frames) == [1, 4, 7]
 
 
-def test_a_folder_of_sequences_is_all_of_them_with_names_of_their_own(road, tmp_path):
+def test_a_folder_of_sequences_gives_all_of_them_with_distinct_names(road, tmp_path):
     for name in ('00', '01'):
         shutil.copytree(road, tmp_path / 'sequences' / name)
         (tmp_path / 'poses').mkdir(exist_ok=True)
@@ -397,7 +397,7 @@ def called(process: str) -> bytes:
 
 
 @pytest.mark.slow
-def test_a_killed_run_is_taken_up_where_it_ended(road, short, running, tmp_path):
+def test_a_killed_run_is_resumed(road, short, running, tmp_path):
     children = workers_of(running)
     running.kill()
     running.wait()
@@ -414,7 +414,8 @@ def test_a_killed_run_is_taken_up_where_it_ended(road, short, running, tmp_path)
 
 
 @pytest.mark.slow
-def test_a_workers_death_is_said_and_costs_only_its_chunk(road, short, running, tmp_path):
+def test_the_death_of_a_worker_is_reported_and_loses_only_its_chunk(
+        road, short, running, tmp_path):
     for worker in workers_of(running):
         os.kill(worker, signal.SIGKILL)
     _, printed = running.communicate(timeout=60)
@@ -454,7 +455,7 @@ except KeyboardInterrupt:
 """
 
 
-def test_ctrl_c_is_heard_whichever_thread_the_system_gives_it_to():
+def test_ctrl_c_ends_the_run_whichever_thread_receives_it():
     answer = subprocess.run([sys.executable, '-c', UNHEARD], capture_output=True, text=True,
                             timeout=60)
     assert answer.stdout == 'heard\n', answer.stderr
@@ -538,7 +539,8 @@ def test_a_damaged_store_is_named(road, tmp_path):
     (['road', '--max-features', '3'], 'max_features is 3; it must lie between'),
     (['road', '--workers', '2', '--scheduler', 'tcp://x'], 'not allowed with argument'),
 ])
-def test_a_wrong_call_is_one_line_and_exit_code_2(road, tmp_path, arguments, printed, monkeypatch):
+def test_an_invalid_call_is_one_line_and_exit_code_2(
+        road, tmp_path, arguments, printed, monkeypatch):
     monkeypatch.chdir(tmp_path)
     called = [str(road) if word == 'road' else word for word in arguments]
     answer = djet('evaluate', *called, '--output', tmp_path / 'results')
@@ -558,7 +560,7 @@ def test_missing_poses_are_one_line_and_exit_code_2(small_kitti, tmp_path):
     assert 'has no ground truth for two consecutive frames' in answer.stderr
 
 
-def test_a_scheduler_that_is_not_there_is_one_line_and_costs_no_earlier_records(road, tmp_path):
+def test_an_absent_scheduler_is_one_line_and_keeps_earlier_records(road, tmp_path):
     pytest.importorskip('distributed')
     (tmp_path / 'records.jsonl').write_text('of an earlier run\n')
     answer = djet('evaluate', road, '--end', '3', '--output', tmp_path, '--overwrite',
@@ -570,7 +572,7 @@ def test_a_scheduler_that_is_not_there_is_one_line_and_costs_no_earlier_records(
 
 # The page
 
-def test_everything_that_the_page_refers_to_is_there(evaluated):
+def test_all_files_that_the_page_refers_to_exist(evaluated):
     page = (evaluated / 'index.html').read_text()
     named = re.findall(r'(?:src|href)="([^"]+)"', page)
     assert len([name for name in named if name.endswith('.png')]) == 4
@@ -594,7 +596,7 @@ def test_the_page_shows_its_plots_in_a_browser(evaluated, tmp_path):
     assert blue.sum() > 500
 
 
-def test_evo_finds_no_error_in_the_truth_itself(evaluated):
+def test_evo_finds_no_error_in_the_ground_truth(evaluated):
     if not shutil.which('evo_ape') and not (Path(sys.executable).parent / 'evo_ape').exists():
         pytest.skip('evo is not installed')
     truth = evaluated / 'trajectories' / 'road' / 'ground_truth.tum'
@@ -635,7 +637,7 @@ def test_an_ablation_has_a_row_for_each_change(road, tmp_path):
     assert (tmp_path / 'plots' / 'road_ablation.png').stat().st_size > 10_000
 
 
-def test_a_variant_is_the_same_in_company_as_alone(road, tmp_path):
+def test_a_variant_has_the_same_results_with_others_as_alone(road, tmp_path):
     source, = open_datasets([road], Selection(), tmp_path)
     variants = [method for method in ablation_methods(['best'], ['patch', 'grading', 'tests'], (),
                                                       {}) if method.name == 'djet']
@@ -647,7 +649,7 @@ def test_a_variant_is_the_same_in_company_as_alone(road, tmp_path):
             == {(one.change, one.pair): one.rotation for one in alone})
 
 
-def test_a_good_start_leaves_no_failure_to_squares(road, tmp_path):
+def test_with_a_good_start_squares_do_not_fail(road, tmp_path):
     source, = open_datasets([road], Selection(), tmp_path)
     config = preset('paper', method='rpe')
     records = evaluate_chunk(PairChunk(source, 0, 5), [

@@ -55,12 +55,12 @@ def test_pictures_agree_with_depth_and_motion_far_below_a_pixel(name: str, first
     shift = shifts(pair_of(scene, first))
     assert len(shift) > 40
     assert np.linalg.norm(np.median(shift, axis=0)) < 0.02
-    # On walls that are nearly white, gray levels are too coarse to tell more.
+    # On walls that are nearly white, gray levels are too coarse for more.
     assert np.median(np.linalg.norm(shift, axis=1)) < (0.1 if name == 'indoor' else 0.03)
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_every_seed_is_another_place_and_the_same_seed_the_same_one(name: str) -> None:
+def test_every_seed_gives_another_scene_and_the_same_seed_the_same_one(name: str) -> None:
     scenes = [make_scene(name, seed, TINY) for seed in (0, 1, 2, 0)]
     first, *others, again = (clean(scene).render(scene.trajectory(9)[8]) for scene in scenes)
     assert all((np.abs(first.astype(int) - other) > 4).mean() > 0.4 for other in others)
@@ -76,7 +76,7 @@ def test_a_scene_has_parallax_if_its_points_move_by_more_than_rotation_does(name
     moved = []
     for i in range(0, frames - 1, 4):
         metres = np.linalg.norm((np.linalg.inv(poses[i]) @ poses[i + 1])[:3, 3])
-        # The size of a picture does not matter to what is told in pixels of the usual size.
+        # Motion in pixels of the default size does not depend on the size of the images.
         focal = scene.K[0, 0] * find(name).size[0] / TINY[0]
         moved.append(np.median(focal * metres / scene.depth(poses[i], i)))
     assert (np.median(moved) > _MOVES) == find(name).parallax
@@ -84,7 +84,7 @@ def test_a_scene_has_parallax_if_its_points_move_by_more_than_rotation_does(name
 
 # Indoors
 
-def test_edges_indoors_are_like_stairs() -> None:
+def test_indoor_edges_have_stair_steps() -> None:
     """The outline of a tilted white board before black has no pixel between black and white."""
     def picture(samples: int) -> NDArray[np.uint8]:
         board = fitted((-1, -1.2, 4), (2, 0.21, 0), (-0.13, 1.9, 0),
@@ -96,7 +96,7 @@ def test_edges_indoors_are_like_stairs() -> None:
     assert ((picture(2) > 20) & (picture(2) < 180)).sum() > 100
 
 
-def test_the_walls_indoors_are_nearly_white_and_tiles_repeat() -> None:
+def test_indoor_walls_are_nearly_white_and_tiles_repeat() -> None:
     bright = weak = 0
     for seed in range(3):
         scene = make_scene('indoor', seed, SMALL)
@@ -108,7 +108,7 @@ def test_the_walls_indoors_are_nearly_white_and_tiles_repeat() -> None:
     assert weak > 0.75
 
 
-def test_the_floor_mirrors_a_lamp_where_the_law_of_reflection_puts_it() -> None:
+def test_the_floor_reflects_a_lamp_by_the_law_of_reflection() -> None:
     lamp = fitted((-0.2, -2.5, 4.0), (0.4, 0, 0), (0, 0, 0.4),
                   make_texture(np.full((4, 4), 200, np.float32), (1.0, 1.0)))
     floor = tiled((-20, 0, -5), (40, 0, 0), (0, 0, 60),
@@ -136,7 +136,7 @@ def test_the_floor_mirrors_a_lamp_where_the_law_of_reflection_puts_it() -> None:
     assert gap[1:].min() > 15
 
 
-def test_the_floor_mirrors_more_towards_the_horizon_and_nothing_else_mirrors() -> None:
+def test_the_floor_reflects_more_towards_the_horizon_and_nothing_else_reflects() -> None:
     scene = make_scene('indoor', size=SMALL)
     pose = scene.trajectory(1)[0]
     matt, glossy = (replace(scene, effects=effects).render(pose).astype(float)
@@ -151,7 +151,7 @@ def test_the_floor_mirrors_more_towards_the_horizon_and_nothing_else_mirrors() -
     assert not changed[~floor & (down < 0)].any()
 
 
-def test_the_way_through_the_corridor_keeps_clear_of_its_walls() -> None:
+def test_the_path_through_the_corridor_stays_clear_of_its_walls() -> None:
     for seed in range(20):
         plan = Plan.draw(np.random.default_rng(seed))
         points = plan.route().points
@@ -167,7 +167,7 @@ def test_the_way_through_the_corridor_keeps_clear_of_its_walls() -> None:
 # In the hand
 
 @pytest.mark.parametrize('seed', range(5))
-def test_a_hand_turns_in_jerks_and_at_times_only_turns(seed: int) -> None:
+def test_a_handheld_camera_rotates_in_jerks_and_at_times_only_rotates(seed: int) -> None:
     scene = make_scene('handheld', seed, TINY)
     turns, lengths = steps_of(scene, 60)
     rates = np.linalg.norm(turns, axis=1)
@@ -180,7 +180,7 @@ def test_a_hand_turns_in_jerks_and_at_times_only_turns(seed: int) -> None:
     assert (lengths > 0.01).sum() > 20
 
 
-def test_what_moves_during_the_exposure_is_blurred_along_its_motion_and_stays_in_place() -> None:
+def test_motion_during_the_exposure_blurs_along_it_without_a_shift() -> None:
     K = centred_camera(SMALL, 0.8)
     gray = 128 + 40 * fractal(np.random.default_rng(1), (512, 512), 0.8)[:SMALL[1], :SMALL[0]]
     shot = Shot(gray, np.ones_like(gray), K, np.eye(4), 0, 0)
@@ -201,7 +201,7 @@ def test_what_moves_during_the_exposure_is_blurred_along_its_motion_and_stays_in
     np.testing.assert_allclose(still, gray, atol=1e-3)
 
 
-def test_the_hand_tells_by_how_much_it_turns() -> None:
+def test_the_handheld_scene_states_its_rotation() -> None:
     path = make_scene('handheld', 3, TINY).path
     for index in (0, 7, path.limit - 1):
         first, last = max(index - 1, 0), min(index + 1, path.limit - 1)
@@ -211,7 +211,7 @@ def test_the_hand_tells_by_how_much_it_turns() -> None:
 
 # In the wood
 
-def test_the_wood_is_weak_in_texture_and_deep() -> None:
+def test_the_forest_has_weak_texture_and_depth() -> None:
     wood, road = (make_scene(name, size=(480, 270)) for name in ('forest', 'road'))
     slopes = []
     for scene in (wood, road):
@@ -224,7 +224,7 @@ def test_the_wood_is_weak_in_texture_and_deep() -> None:
     assert far > 20
 
 
-def test_the_wood_stands_on_its_ground() -> None:
+def test_trees_of_the_forest_stand_on_its_ground() -> None:
     """Neighbouring triangles of the ground share corners, so that nobody sees through it."""
     panels = forest(winding(8, 0.2, (23,)), np.random.default_rng(2))
     ground = [p for p in panels if p.triangle]

@@ -82,7 +82,7 @@ def wait_for(ready: Callable[[], bool]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize('seed', range(4))
-def test_what_was_written_before_a_kill_is_readable(drive, tmp_path, seed):
+def test_data_written_before_a_kill_is_readable(drive, tmp_path, seed):
     results = tmp_path / 'results'
     process = subprocess.Popen([*DJET, 'replay', drive, '--output', results], env=ONE_THREAD,
                                stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -201,7 +201,7 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize('name', COMMANDS)
-def test_a_second_run_changes_nothing_and_says_how_to(tmp_path, capsys, name):
+def test_a_second_run_changes_nothing_and_names_the_option_to_replace(tmp_path, capsys, name):
     sequence = write_small_kitti(tmp_path / 'data', frames=2, size=(160, 120))
     arguments = [word.replace('SEQUENCE', str(sequence)).replace('OUT', str(tmp_path / 'out'))
                  .replace('IMAGE', str(sequence / 'image_0' / '000000.png'))

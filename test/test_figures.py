@@ -139,8 +139,8 @@ def test_two_images_and_a_camera_give_the_same_as_a_sequence(road, tmp_path, cap
     (['surfaces', 'road', '--match', '99999'], '--match is 99999; this pair has matches 0 to'),
     (['surfaces', 'road', '--output', 'a.jpg'], 'its name must end in .png or .gif'),
 ])
-def test_a_wrong_call_is_one_line_and_exit_code_2(road, tmp_path, arguments, message, capsys,
-                                                  monkeypatch):
+def test_an_invalid_call_is_one_line_and_exit_code_2(
+        road, tmp_path, arguments, message, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'text').write_text('no image')
     cv2.imwrite(str(tmp_path / 'flat.png'), np.zeros((200, 200), np.uint8))

@@ -179,7 +179,7 @@ def test_a_rotation_fit_is_exact_and_robust_to_outliers():
     rng = np.random.default_rng(5)
     seen = two_views(rng, count=200)
     rays_x = rays(K, seen.x)
-    turned = rays_x @ seen.R.T * rng.uniform(0.5, 2, (200, 1))  # the length of a ray says nothing
+    turned = rays_x @ seen.R.T * rng.uniform(0.5, 2, (200, 1))  # rays of any length
     assert rotation_angle(fit_rotation(rays_x, turned), seen.R) < 1e-9
     turned[:60] += (0.05, 0.01, 0)  # a lorry passes by
     turned += rng.normal(0, 1e-4, turned.shape)

@@ -148,7 +148,7 @@ def check_the_map(listener: Peer, to_the_right: list[int]) -> None:
     assert map_to_odom.keys() == odom_to_child.keys() == by_odometry.keys()
     for stamp in by_odometry:
         assert np.allclose(by_odometry[stamp], odom_to_child[stamp], atol=1e-12)
-    # the first path to a frame goes out with the frame's own correction
+    # the first path of a frame is published with the correction of that frame
     first: dict[int, Any] = {}
     for message in listener.received[PATH]:
         stamp, here = pose_of(message.poses[-1])

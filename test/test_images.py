@@ -84,7 +84,7 @@ def test_a_mosaic_gives_nearly_the_same_gray_and_its_neighbours_do_not(pattern, 
 
 
 @pytest.mark.parametrize('encoding, chroma_rows', [('nv12', 18), ('nv21', 18), ('nv24', 72)])
-def test_of_planes_the_first_is_the_gray(encoding, chroma_rows):
+def test_the_first_of_several_planes_is_the_gray_one(encoding, chroma_rows):
     message = image(planes(chroma_rows), encoding, height=GRAY.shape[0])
     assert np.array_equal(gray_image(message), GRAY)
 

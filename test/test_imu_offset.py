@@ -44,7 +44,7 @@ def test_offset_mounting_and_bias_are_found(offset: float) -> None:
     assert np.linalg.norm(fit.bias - felt.rate_biases.mean(0)) < 1e-3
 
 
-def test_some_pairs_that_are_wrong_do_not_matter() -> None:
+def test_a_few_wrong_pairs_do_not_matter() -> None:
     poses = trajectory()
     felt, turns = feel(poses, 0.1, Mems(), 1), seen(poses, np.radians(0.02))
     turns.R[::6] = np.eye(3)
@@ -52,21 +52,21 @@ def test_some_pairs_that_are_wrong_do_not_matter() -> None:
     assert fit.offset == pytest.approx(0.04, abs=1e-3)
 
 
-def test_a_camera_that_hardly_turns_tells_nothing() -> None:
+def test_a_camera_that_hardly_rotates_gives_no_estimate() -> None:
     poses = np.tile(np.eye(4), (60, 1, 1))
     felt = feel(poses, 0.1, Mems(), 1)
     with pytest.raises(DjetError, match='do not determine an offset; record at least 20'):
         fit_imu(seen(poses, 1e-5), felt.stamps_ns + 5 * 10**9, felt.rates)
 
 
-def test_clocks_that_are_far_apart_are_said() -> None:
+def test_clocks_far_apart_are_reported() -> None:
     poses = trajectory()
     felt = feel(poses, 0.1, Mems(), 1)
     with pytest.raises(DjetError, match='the IMU covers 0 of 149 pairs'):
         fit_imu(seen(poses, 1e-5), felt.stamps_ns + 500 * 10**9, felt.rates)
 
 
-def test_the_command_prints_what_goes_into_a_parameter_file(
+def test_the_command_prints_lines_for_a_parameter_file(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = render_sequence('handheld', tmp_path, 30, 0, (320, 240))
     assert main(['lab', 'imu-offset', str(folder)]) == 0

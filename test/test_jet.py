@@ -211,7 +211,7 @@ def test_minimising_never_ends_above_the_cost_of_the_start(name, kind):
         found = minimise(problem, R, t, loss)
         there = epipolar_residuals(problem, found.R, found.t)
         assert (there.sign * loss(there.r**2)[0]).sum() <= cost
-        # and the solution says the truth about itself
+        # and the solution has the residuals and costs of its pose
         assert np.allclose(found.residuals.r, there.r)
 
 

@@ -37,7 +37,7 @@ def test_real_frames_are_read(kitti):
     assert sequence.K[0, 0] == 721.5377
 
 
-def test_what_rectification_left_of_distortion_is_undone(small_kitti):
+def test_residual_distortion_of_rectified_images_is_undone(small_kitti):
     folder = small_kitti(size=(64, 48))
     rectified = KittiSequence(folder)
     with (folder / 'calib.txt').open('a') as calibration:
@@ -60,7 +60,7 @@ def test_a_range_of_frames_starts_its_own_poses(small_kitti):
     assert np.allclose(whole.poses[2] @ part.poses[2], whole.poses[4])
 
 
-def test_poses_are_found_beside_or_given_or_absent(small_kitti, tmp_path):
+def test_poses_are_found_next_to_the_sequence_or_given_or_absent(small_kitti, tmp_path):
     folder = small_kitti()
     beside = folder.parent.parent / 'poses' / '07.txt'
     given = beside.rename(tmp_path / 'truth.txt')

@@ -32,7 +32,7 @@ def moment(frame: int = 1, aid: str = GYRO, seed: int = 0, dark: bool = False,
                   10 * off, bias)
 
 
-def test_every_pair_of_the_whip_turns_by_fifteen_degrees_and_goes_on() -> None:
+def test_every_pair_of_the_fast_turn_rotates_by_15_degrees_and_translates() -> None:
     poses = make_scene('whip', 3).trajectory(30)
     turns = [np.degrees(rotation_angle(a[:3, :3], b[:3, :3])) for a, b in pairwise(poses)]
     lengths = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
@@ -40,7 +40,7 @@ def test_every_pair_of_the_whip_turns_by_fifteen_degrees_and_goes_on() -> None:
     assert lengths.min() > 0.01
 
 
-def test_where_the_motion_before_misleads_the_measured_turn_leads_back() -> None:
+def test_a_measured_rotation_corrects_a_misleading_previous_motion() -> None:
     scene, frame = make_scene('whip', 105), 37
     poses, estimator = scene.trajectory(61), TwoViewEstimator()
     before, previous, current = (
@@ -54,7 +54,7 @@ def test_where_the_motion_before_misleads_the_measured_turn_leads_back() -> None
     assert rotation < 0.1 and direction < 2
 
 
-def test_of_two_bodies_that_may_turn_as_was_measured_each_is_led_to_its_end() -> None:
+def test_both_bodies_that_may_have_the_measured_rotation_are_refined() -> None:
     scene, frame, estimator = make_scene('moving_object', 58), 12, TwoViewEstimator()
     poses = scene.trajectory(41)[frame - 1:frame + 1]
     views = [estimator.view(scene.render(pose, frame - 1 + i), scene.K)
@@ -71,7 +71,7 @@ def felt_turn(poses: Array) -> KnownMotion:
     return KnownMotion(MeasuredRotation(R, np.radians(0.01)**2 * np.eye(3)))
 
 
-def test_traffic_passes_before_a_camera_that_stands() -> None:
+def test_traffic_passes_a_stationary_camera() -> None:
     scene = make_scene('traffic', 31, (248, 76))
     assert np.allclose(scene.trajectory(20), np.eye(4), atol=1e-12)
     depths = np.array([scene.depth(np.eye(4), i) for i in range(0, 60, 4)])
@@ -81,7 +81,7 @@ def test_traffic_passes_before_a_camera_that_stands() -> None:
     assert hidden.min() < hidden.max() / 2  # which come and go
 
 
-def test_moments_are_summed_up_and_the_dark_is_counted_by_itself() -> None:
+def test_frames_are_summarised_and_dark_ones_counted_separately() -> None:
     row, = trial_rows([moment(1), moment(2, off=0.3), moment(3, tracked=False, failed=True),
                        moment(4, failed=True, off=5.0), moment(5, dark=True, off=0.4),
                        moment(1, seed=1, bias=0.5)])
@@ -93,7 +93,7 @@ def test_moments_are_summed_up_and_the_dark_is_counted_by_itself() -> None:
     assert not is_wrong(moment(tracked=False, failed=True))
 
 
-def test_the_command_runs_each_trial_with_all_aids_and_takes_up_where_it_ended(
+def test_the_command_runs_each_trial_with_all_inputs_and_resumes(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ['lab', 'beside', '--trials', 'lorry', '--seeds', '0', '--frames', '3',
                '--workers', '1', '--output', str(tmp_path)]
@@ -102,7 +102,7 @@ def test_the_command_runs_each_trial_with_all_aids_and_takes_up_where_it_ended(
     assert [(row['aid'], row['pairs']) for row in rows] == [(NOTHING, 2), (GYRO, 2), (MASK, 2)]
     _, with_gyro, masked = rows
     assert masked['failed'] == 0 and masked['direction_deg'][1] < 2
-    # Whatever its bias may be, nobody takes the lorry for the world.
+    # With any bias, the lorry is not taken for the static world.
     assert with_gyro['wrong'] == 0 and with_gyro['bias_off'][0] < 1.05
     output, records = capsys.readouterr().out, (tmp_path / 'records.jsonl').read_bytes()
     assert main(command) == 0
@@ -113,7 +113,7 @@ def test_the_command_runs_each_trial_with_all_aids_and_takes_up_where_it_ended(
 @pytest.mark.parametrize(('arguments', 'output'), [
     (('--trials', 'moon'), "'moon'"), (('--frames', '2'), '--frames is 2'),
     (('--workers', '0'), 'workers is 0')])
-def test_what_can_be_mended_is_one_line_and_exit_code_2(
+def test_user_errors_are_one_line_and_exit_code_2(
         tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...],
         output: str) -> None:
     assert main(['lab', 'beside', *arguments, '--output', str(tmp_path)]) == 2
@@ -134,7 +134,7 @@ def gone(scene: Scene, poses: Array, seed: int, period: float = 0.1, first: int 
             for i, pose in enumerate(poses)]
 
 
-def test_with_a_gyro_a_camera_stands_while_lorries_fill_most_of_the_picture() -> None:
+def test_with_a_gyro_a_camera_is_stationary_while_lorries_fill_most_of_the_image() -> None:
     scene = make_scene('traffic', 31, (620, 188))
     results = gone(scene, scene.trajectory(12), 31)
     assert sum(result.stationary for result in results) > len(results) / 2
@@ -144,7 +144,7 @@ def test_with_a_gyro_a_camera_stands_while_lorries_fill_most_of_the_picture() ->
 
 
 @pytest.mark.parametrize('seed', [105, 106])
-def test_a_camera_stands_for_what_stood_before_it_while_lorries_hide_nearly_all(seed: int) -> None:
+def test_static_features_prove_a_standstill_while_lorries_hide_nearly_all(seed: int) -> None:
     scene = make_scene('traffic', seed)
     results = gone(scene, scene.trajectory(10), seed)
     assert all(result.stationary for result in results[1:])
@@ -152,7 +152,7 @@ def test_a_camera_stands_for_what_stood_before_it_while_lorries_hide_nearly_all(
 
 @pytest.mark.slow
 @pytest.mark.parametrize('seed', [102, 106])
-def test_depths_of_a_lorry_do_not_speak_against_the_motion_that_a_gyro_confirms(seed: int) -> None:
+def test_depths_of_a_lorry_do_not_contradict_a_motion_that_a_gyro_confirms(seed: int) -> None:
     scene = make_scene('moving_object', seed)
     poses = scene.trajectory(18)
     for result, (one, other) in zip(gone(scene, poses, seed)[1:], pairwise(poses), strict=True):
@@ -160,7 +160,7 @@ def test_depths_of_a_lorry_do_not_speak_against_the_motion_that_a_gyro_confirms(
         assert angle_errors(result.motion, np.linalg.inv(one) @ other)[1] < 2
 
 
-def test_at_the_start_a_camera_moves_whose_gyro_feels_nothing_if_nothing_stands() -> None:
+def test_at_the_start_a_camera_moves_without_rotation_if_no_feature_is_static() -> None:
     scene = make_scene('road', 31, (620, 188))
     poses = np.tile(np.eye(4), (6, 1, 1))
     poses[:, 2, 3] = 0.5 * np.arange(6)
@@ -169,7 +169,7 @@ def test_at_the_start_a_camera_moves_whose_gyro_feels_nothing_if_nothing_stands(
 
 
 @pytest.mark.slow
-def test_a_lorry_that_hides_everything_has_not_set_a_standing_camera_in_motion() -> None:
+def test_a_lorry_that_hides_everything_does_not_move_a_stationary_camera() -> None:
     seen = set()
     for seed in (70, 71, 73):
         scene = make_scene('traffic', seed, (620, 188))
@@ -181,7 +181,7 @@ def test_a_lorry_that_hides_everything_has_not_set_a_standing_camera_in_motion()
 
 
 @pytest.mark.parametrize(('axis', 'step'), [(0, 0.05), (2, 0.2)])
-def test_a_camera_that_glides_off_without_a_turn_does_not_stand(axis: int, step: float) -> None:
+def test_a_camera_that_starts_without_rotation_is_not_stationary(axis: int, step: float) -> None:
     scene = make_scene('road', 31, (620, 188))
     poses = np.tile(np.eye(4), (8, 1, 1))
     poses[4:, axis, 3] = step * np.arange(1, 5)
@@ -190,7 +190,7 @@ def test_a_camera_that_glides_off_without_a_turn_does_not_stand(axis: int, step:
     assert not any(result.stationary for result in results[4:])
 
 
-def test_a_camera_that_glides_on_without_a_turn_is_believed_in_the_end() -> None:
+def test_a_camera_that_keeps_moving_without_rotation_is_found_to_move() -> None:
     scene = make_scene('road', 31, (620, 188))
     poses = np.tile(np.eye(4), (12, 1, 1))
     poses[3:, 2, 3] = 0.3 * np.arange(1, 10)

@@ -19,7 +19,7 @@ PACKAGE = Path(djet_ros.__file__).parent
 MANIFEST = ElementTree.parse(Path(__file__).parents[1] / 'package.xml')
 ROS_LIBRARIES = {depend.text for depend in MANIFEST.iter('exec_depend')}
 
-# From the bottom up. Rooms in one tuple are beside one another and do not know each other.
+# From the bottom up. Packages in one tuple do not import one another.
 ORDER = (('__init__', 'errors', 'libraries', 'threads'), ('compiled',), ('core',), ('config',),
          ('odometry',), ('recordings',), ('posegraph',), ('replay',), ('live',), ('ros', 'dds'),
          ('lab',), ('cli',))
@@ -102,13 +102,13 @@ def planted(module: str, name: str) -> Imports:
     return {**IMPORTS, module: IMPORTS[module] | {name}}
 
 
-def test_every_room_has_its_place_in_the_order() -> None:
+def test_every_package_has_its_place_in_the_order() -> None:
     rooms = {path.stem for path in PACKAGE.iterdir()
              if path.suffix == '.py' or (path.is_dir() and any(path.glob('*.py')))}
     assert rooms == set(FLOOR)
 
 
-def test_no_module_imports_from_a_room_above_or_beside_its_own() -> None:
+def test_no_module_imports_from_a_package_above_or_next_to_its_own() -> None:
     assert not upward(IMPORTS)
 
 
@@ -118,15 +118,15 @@ def test_no_module_imports_from_a_room_above_or_beside_its_own() -> None:
     ('djet_ros.posegraph.pose_graph', 'djet_ros.replay.results.BAG'),
     ('djet_ros.dds.graph', 'djet_ros.ros.vo_node.make'),
     ('djet_ros.live.session', 'djet_ros.lab.soak')])
-def test_an_upward_import_would_be_seen(module: str, name: str) -> None:
+def test_an_upward_import_is_detected(module: str, name: str) -> None:
     assert upward(planted(module, name)) == {(module, name)}
 
 
-def test_no_modules_import_one_another_in_a_ring() -> None:
+def test_no_modules_import_one_another_in_a_cycle() -> None:
     assert not cycle(IMPORTS)
 
 
-def test_a_ring_of_imports_would_be_seen() -> None:
+def test_a_cycle_of_imports_is_detected() -> None:
     ring = cycle(planted('djet_ros.core.types', 'djet_ros.core.estimator.TwoViewEstimator'))
     assert ring[0] == ring[-1]
     assert {'djet_ros.core.types', 'djet_ros.core.estimator'} <= set(ring)
@@ -136,7 +136,7 @@ def in_room(name: str) -> Iterable[str]:
     return (module for module in TREES if module.split('.')[1] == name)
 
 
-def test_the_core_knows_arrays_and_nothing_of_files_threads_or_terminals() -> None:
+def test_the_core_uses_arrays_and_no_files_threads_or_terminals() -> None:
     for module in in_room('core'):
         assert libraries(module) <= (sys.stdlib_module_names - OUTSIDE_WORLD) | CORE_LIBRARIES
         called = {node.func.id for node in ast.walk(TREES[module])
@@ -144,13 +144,13 @@ def test_the_core_knows_arrays_and_nothing_of_files_threads_or_terminals() -> No
         assert not called & OUTSIDE_CALLS, module
 
 
-def test_what_comes_with_ros_is_imported_by_the_ros_face_only() -> None:
+def test_packages_of_ros_are_imported_by_the_ros_package_only() -> None:
     users = {module for module in TREES if libraries(module) & ROS_LIBRARIES}
     assert users
     assert users <= set(in_room('ros'))
 
 
-def test_who_misses_a_module_of_ros_is_told_the_package_that_package_xml_asks_for() -> None:
+def test_a_missing_module_of_ros_names_the_package_in_package_xml() -> None:
     asked = {node.args[1].value for node in ast.walk(TREES['djet_ros.ros.parameters'])
              if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
              and node.func.id == '_require' and isinstance(node.args[1], ast.Constant)}
@@ -184,7 +184,7 @@ def test_every_library_is_a_declared_dependency() -> None:
     assert not undeclared
 
 
-def test_whoever_misses_a_library_is_told_what_setup_py_says() -> None:
+def test_a_missing_library_names_the_extra_in_setup_py() -> None:
     declared = [line.replace('"', "'") for line in requires('djet_ros') or []]
     for library, extra in EXTRAS.items():
         assert any(name_of(line) == library and f"extra == '{extra}'" in line

@@ -70,7 +70,7 @@ def asl(tmp_path: Path) -> Path:
 
 # EuRoC and TUM-VI
 
-def test_opencvs_yaml_is_read_as_what_it_says(asl: Path) -> None:
+def test_the_yaml_of_opencv_is_read(asl: Path) -> None:
     sequence = euroc(asl)
     assert sequence.K.tolist() == [[110.0, 0, 80], [0, 109, 60], [0, 0, 1]]
     assert sequence.distortion.tolist() == [-0.28, 0.07, 0.0002, 0.00002, 0]
@@ -87,7 +87,7 @@ def test_a_cut_or_odd_header_is_one_line(asl: Path, header: str) -> None:
     assert '\n' not in str(caught.value)
 
 
-def test_what_the_imu_felt_is_turned_to_the_camera(asl: Path) -> None:
+def test_imu_samples_are_rotated_to_the_camera(asl: Path) -> None:
     imu = euroc(asl).imu
     assert imu is not None
     assert len(imu.stamps_ns) == 25
@@ -107,14 +107,14 @@ def test_samples_come_before_the_image_up_to_the_first_one_after_it(asl: Path) -
     assert error_text[0].topic == recording.auxiliary['frames']
 
 
-def test_nothing_of_the_imu_comes_unless_it_is_wanted(asl: Path) -> None:
+def test_imu_samples_are_only_read_on_request(asl: Path) -> None:
     with open_recording(asl) as recording:
         assert recording.auxiliary == {}
         assert {one.message.__msgtype__ for one in recording.messages()} == {
             'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo'}
 
 
-def test_a_folder_without_an_imu_says_so(asl: Path) -> None:
+def test_a_folder_without_an_imu_is_one_line(asl: Path) -> None:
     shutil.rmtree(asl / 'mav0' / 'imu0')
     with pytest.raises(DjetError, match='holds no IMU data'):
         open_recording(asl, auxiliary={'imu': None})
@@ -217,7 +217,7 @@ def seven_scenes_folder(folder: Path, suffix: str) -> Path:
 
 
 @pytest.mark.parametrize('suffix', ['png', 'jpg'])
-def test_7_scenes_is_read_as_it_is(tmp_path: Path, suffix: str) -> None:
+def test_7_scenes_is_read_as_published(tmp_path: Path, suffix: str) -> None:
     sequence = open_sequence(seven_scenes_folder(tmp_path / 'seq-01', suffix))
     assert sequence.K.tolist() == [[585, 0, 320], [0, 585, 240], [0, 0, 1]]
     assert sequence.poses is not None
@@ -266,7 +266,7 @@ def raw(tmp_path: Path) -> Path:
     return drive
 
 
-def test_a_raw_drive_of_kitti_is_read_as_it_is(raw: Path) -> None:
+def test_a_raw_drive_of_kitti_is_read_as_published(raw: Path) -> None:
     sequence = open_sequence(raw)
     assert sequence.K.tolist() == [[50, 0, 80], [0, 50, 60], [0, 0, 1]]
     assert sequence.stamps_ns[0] == 1317042145_464389445
@@ -322,7 +322,7 @@ def test_a_raw_drive_without_images_is_named(raw: Path) -> None:
         open_sequence(raw)
 
 
-def test_a_raw_drive_asks_for_its_calibration(raw: Path) -> None:
+def test_a_raw_drive_without_calibration_names_the_file(raw: Path) -> None:
     (raw.parent / 'calib_cam_to_cam.txt').unlink()
     with pytest.raises(DjetError, match='calib_cam_to_cam.txt is missing; download'):
         open_sequence(raw)

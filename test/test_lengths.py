@@ -54,7 +54,7 @@ def results_of(values: NDArray[np.float64], sigmas: NDArray[np.float64],
     return results
 
 
-def test_lengths_that_err_as_they_say_have_the_squares_of_chance() -> None:
+def test_lengths_with_the_claimed_errors_have_the_expected_squares() -> None:
     rng = np.random.default_rng(0)
     true = rng.uniform(0.5, 2, 4000)
     drifting = true * np.exp(np.cumsum(rng.normal(0, 1e-4, 4000)))  # which is no step's error
@@ -66,7 +66,7 @@ def test_lengths_that_err_as_they_say_have_the_squares_of_chance() -> None:
 
 
 @pytest.mark.parametrize('stays', [0.3, 0.6])
-def test_what_stays_of_an_error_is_in_the_neighbours_too(stays: float) -> None:
+def test_the_lasting_part_of_an_error_is_in_neighbours_too(stays: float) -> None:
     rng = np.random.default_rng(2)
     errors = rng.normal(0, 0.001, 4000)
     estimated = np.exp(errors + stays * np.append(0.0, np.cumsum(errors)[:-1]))
@@ -77,7 +77,7 @@ def test_what_stays_of_an_error_is_in_the_neighbours_too(stays: float) -> None:
 
 
 @pytest.mark.parametrize('claimed', [1.0, 0.5])
-def test_stretches_that_wander_as_they_say_have_the_squares_of_chance(claimed: float) -> None:
+def test_segments_with_the_claimed_drift_have_the_expected_squares(claimed: float) -> None:
     rng = np.random.default_rng(1)
     walk = np.cumsum(rng.normal(0, 0.004, 3000))
     own = np.full(len(walk), 1e-3)
@@ -91,7 +91,7 @@ def test_stretches_that_wander_as_they_say_have_the_squares_of_chance(claimed: f
     assert np.median(poses) / chi2.median(1) == pytest.approx(1 / claimed**2, rel=0.2)
 
 
-def test_a_way_is_held_against_the_truth_whatever_its_unit() -> None:
+def test_a_path_is_compared_with_the_truth_in_any_unit() -> None:
     true, chunk = np.full(300, 1.0), DriveChunk('road', 0, None, 301, 100)
     estimated = 5 * np.exp(1e-3 * np.arange(300))
     metric = true * np.where((np.arange(300) >= 60) & (np.arange(300) < 160), 0.98, 1.0)
@@ -113,7 +113,7 @@ def test_a_way_is_held_against_the_truth_whatever_its_unit() -> None:
     assert drive_results(chunk, straight(true), lost, lost).tracked == 0
 
 
-def test_the_command_tells_what_became_of_a_way(
+def test_the_command_reports_the_lengths_of_a_path(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config, chunk = EstimatorConfig(), DriveChunk('road', 0, (620, 188), 3, 0)
     values = run_drive(chunk, config)
@@ -132,7 +132,7 @@ def test_the_command_tells_what_became_of_a_way(
 @pytest.mark.parametrize(('arguments', 'message'), [
     (('--frames', '2'), '--frames is 2'), (('--hidden', '-1'), '--hidden is -1'),
     (('--workers', '0'), 'workers is 0')])
-def test_what_can_be_mended_is_one_line_and_exit_code_2(
+def test_user_errors_are_one_line_and_exit_code_2(
         tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...],
         message: str) -> None:
     assert main(['lab', 'lengths', *arguments, '--output', str(tmp_path)]) == 2

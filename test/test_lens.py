@@ -220,7 +220,7 @@ def test_a_wrong_calibration_is_detected_and_corrected(
     assert (output / 'lens.png').read_bytes().startswith(b'\x89PNG')
 
 
-def test_a_wrong_row_of_a_calib_txt_is_told_by_the_right_one(
+def test_a_wrong_row_of_a_calib_txt_is_recognised_by_the_right_one(
         distorted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wrong = with_row(distorted, tmp_path, 'D: 0.01 0 0 0 0')
     assert main(['lens', str(wrong)]) == 0
@@ -248,7 +248,7 @@ def tracked(sequence: Path, k1: float = 0.0) -> Array:
     return np.array(poses)
 
 
-def test_without_what_the_calibration_left_poses_are_right_and_keep_their_scale(
+def test_without_residual_distortion_poses_are_right_and_keep_their_scale(
         tmp_path: Path) -> None:
     walk = render_sequence('handheld', tmp_path, 16, size=(480, 360))
     seen = through_a_lens(walk, tmp_path / 'seen')
@@ -275,7 +275,7 @@ def raw_bag(distorted: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bag
 
 
-def test_a_driver_gets_a_file_where_its_images_are_raw(
+def test_raw_images_give_a_calibration_file_for_the_driver(
         raw_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['lens', str(raw_bag), '--output', str(tmp_path / 'out')]) == 0
     printed = capsys.readouterr().out
@@ -288,7 +288,7 @@ def test_a_driver_gets_a_file_where_its_images_are_raw(
     assert row_of(printed) == f'D: {D[0]:.4g} 0 0 0 0'
 
 
-def test_of_rectified_images_a_driver_gets_no_file(
+def test_rectified_images_give_no_calibration_file(
         raw_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # As if rectified with an unknown calibration.
     assert main(['lens', str(raw_bag), '--rectified', 'true', '--output', str(tmp_path)]) == 0
@@ -316,14 +316,15 @@ def test_a_file_for_a_driver_differs_in_the_distortion_alone() -> None:
         assert written[name] == {'rows': 3, 'cols': columns, 'data': values.tolist()}
 
 
-def test_a_long_recording_is_held_in_part(whip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_part_of_a_long_recording_is_held_in_memory(
+        whip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lens, 'MOST_PAIRS', 14)
     monkeypatch.setattr(lens, 'LEAST_PAIRS', 10)
     report = examined(whip)
     assert 10 <= len(report.fit.linearised) <= 14 < report.pairs
 
 
-def test_swung_fast_and_blurred_a_right_calibration_stays_right(
+def test_a_correct_calibration_is_kept_with_fast_rotation_and_blur(
         whip: Path, tmp_path: Path) -> None:
     # 15 degrees from frame to frame, and streaks of nine pixels.
     folder = like(whip, tmp_path)
@@ -345,7 +346,7 @@ def test_without_rotation_there_is_no_estimate(
     assert not (tmp_path / 'out').exists()
 
 
-def test_of_a_short_recording_it_says_that_it_is_short(whip: Path) -> None:
+def test_a_short_recording_is_reported_as_too_short(whip: Path) -> None:
     recording = SequenceRecording(KittiSequence(whip, end=9))
     with pytest.raises(DjetError, match='8 of 8 pairs .* record for longer'):
         lens.examine(recording, Config(), lambda: None)
@@ -395,7 +396,7 @@ def test_the_straight_street_of_kitti_06_does_not_determine_k1(kitti: Path) -> N
         lens.examine(SequenceRecording(sequence), Config(), lambda: None)
 
 
-def test_what_is_no_distortion_is_refused() -> None:
+def test_an_estimate_that_is_not_of_distortion_is_refused() -> None:
     pairs = seen_pairs(0, TURNS, 0.0)
     assert abs(lens.trusted_fit(pairs, CAMERA).k1) < 0.02
     farther = [replace(pair, pose=Pose(pair.pose.R @ pair.pose.R, pair.pose.t)) for pair in pairs]

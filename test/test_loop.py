@@ -53,7 +53,7 @@ def test_loop_closure_halves_the_trajectory_error(block, tmp_path, keyframes):
     if 'evo_ape_m' in before:
         assert after['evo_ape_m'] < before['evo_ape_m'] / 2
         # Loops mend the way as a whole. From frame to frame, lengths that were exact give way by
-        # no more than they were said to be unsure.
+        # no more than their standard deviations allow.
         step = said['way'] / (said['frames'] - 1)
         assert after['evo_rpe_m'] < np.hypot(before['evo_rpe_m'], 0.01 * step)
 

@@ -69,7 +69,7 @@ def matrix(pose):
     return result
 
 
-def test_every_message_is_taken_by_the_classes_and_goes_to_the_wire(family):
+def test_every_message_fits_the_classes_and_is_serialised(family):
     message_type, serialised = family
     make, result = Messages(message_type, OdometryConfig()), a_result()
     picture = np.zeros((4, 6, 3), np.uint8)

@@ -17,7 +17,7 @@ def random_pose(rng, size=1.0):
     return result
 
 
-def test_a_camera_that_goes_ahead_carries_its_vehicle_ahead():
+def test_a_camera_that_moves_ahead_moves_its_vehicle_ahead():
     ahead = np.eye(4)
     ahead[2, 3] = 2.0
     pose, _ = pose_of_base(ahead, np.eye(6), AHEAD)
@@ -25,7 +25,7 @@ def test_a_camera_that_goes_ahead_carries_its_vehicle_ahead():
     assert np.allclose(pose[:3, :3], np.eye(3))
 
 
-def test_a_vehicle_that_turns_on_the_spot_stays_where_it_is():
+def test_a_vehicle_that_rotates_in_place_does_not_move():
     turned = np.eye(4)
     turned[:3, :3] = rotation_exp(np.array([0, 0, 0.5]))
     camera = np.linalg.inv(AHEAD) @ turned @ AHEAD

@@ -722,7 +722,7 @@ def test_odometry_is_of_the_base_frame_and_the_camera_keeps_its_tf_parent(
     publisher.advertise('/tf_static', TF_TYPE, durability='transient_local', depth=1)
     publisher.send('/tf_static', MAKE.frame(0, 'base_link', 'camera', AHEAD))
     for i in range(3, 12):
-        # Nothing says when the node has taken the mounting in.
+        # There is no event for the arrival of the mounting.
         play(publisher, drive[i:i + 1], first=i, pause=0.3)
     listener.wait('the vehicle', lambda received: received['/tf'] and stamp_ns(
         received['/tf'][-1].transforms[0].header) == stamp(11))

@@ -37,7 +37,7 @@ def test_a_file_is_written_without_touching_any_other(tmp_path: Path) -> None:
     assert held(tmp_path) == {**mine, 'bashrc': 'ours'}
 
 
-def test_who_may_read_a_new_file_may_read_one_that_was_written_whole(tmp_path: Path) -> None:
+def test_a_file_written_atomically_has_the_permissions_of_a_new_file(tmp_path: Path) -> None:
     for umask in (0o022, 0o027, 0o077):
         before = os.umask(umask)
         try:
@@ -58,7 +58,7 @@ def test_a_file_that_can_not_be_written_leaves_nothing_behind(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize('present', [False, True])
-def test_results_that_can_not_be_begun_leave_the_place_as_it_was(
+def test_results_that_cannot_be_started_leave_the_folder_unchanged(
         present: bool, tmp_path: Path) -> None:
     place = tmp_path / 'results'
     if present:
@@ -76,7 +76,7 @@ def test_results_that_can_not_be_begun_leave_the_place_as_it_was(
 
 
 @pytest.mark.parametrize('verb', [('bench', 'sequence'), ('closure', 'sequence'), ('soak',)])
-def test_figures_are_json_and_their_plot_overwrites_no_photo(
+def test_figures_are_json_and_their_plot_replaces_no_other_image(
         verb: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'f.png').write_text('my photo', 'utf-8')
     for name, why in (('g.png', 'its name must end in .json'),
@@ -90,7 +90,7 @@ def test_figures_are_json_and_their_plot_overwrites_no_photo(
 
 @pytest.mark.parametrize('text', [
     'groceries', 'bread\nmilk', '{"shop": "corner"}\n{"item": "bread"}', '{"shop": "corner"}\n'])
-def test_records_that_are_not_ours_are_refused_as_they_are(text: str, tmp_path: Path) -> None:
+def test_foreign_records_are_refused_and_left_unchanged(text: str, tmp_path: Path) -> None:
     (tmp_path / FILE_NAME).write_text(text, 'utf-8')
     with pytest.raises(DjetError, match='--overwrite'):
         RecordStore(tmp_path, Count, {'frames': 3})

@@ -149,7 +149,7 @@ def test_colcon_puts_the_commands_where_ros2_run_looks(workspace: Path) -> None:
 
 
 @needs_colcon
-def test_colcons_commands_do_not_ask_for_pips_names_of_the_dependencies(
+def test_commands_of_colcon_do_not_require_pip_names_of_dependencies(
         workspace: Path, tmp_path: Path) -> None:
     # Ubuntu's python3-opencv does not provide a distribution 'opencv-python-headless'.
     run(sys.executable, '-m', 'venv', '--without-pip', 'bare', cwd=tmp_path)

@@ -116,7 +116,7 @@ def test_every_stamp_that_a_message_holds_survives_it(stamp):
 
 
 @given(st.integers(-2**31, 2**31 - 1), st.integers(0, 2**32 - 1))
-def test_every_stamp_that_a_sender_may_send_can_be_sent_on(sec, nanosec):
+def test_every_valid_stamp_can_be_forwarded(sec, nanosec):
     sent = header()
     sent.stamp.sec, sent.stamp.nanosec = sec, nanosec
     made = Messages(message_type, OdometryConfig()).header(stamp_ns(sent), 'camera')
@@ -284,7 +284,7 @@ def test_no_speed_makes_a_length_that_is_not_finite(speed):
 
 
 @given(st.lists(vectors, min_size=2, max_size=12), seeds)
-def test_the_straight_way_is_no_longer_than_the_way(positions, seed):
+def test_the_displacement_is_no_longer_than_the_path(positions, seed):
     stamps = np.arange(len(positions), dtype=np.int64) * SECOND // 10 + SECOND
     source = GroundTruthScale(stamps, np.array(positions))
     a, b, c = np.sort(np.random.default_rng(seed).integers(stamps[0], stamps[-1] + 1, 3)).tolist()

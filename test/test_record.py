@@ -62,7 +62,7 @@ def test_a_node_that_exits_is_reported_in_one_line_and_other_tables_are_kept(pla
 
 def test_waiting_for_images_that_never_come_ends(place: Path) -> None:
     before = tables(place)
-    # Of two remappings the first counts, so the node does not hear the player.
+    # The first of two remappings counts, so the node does not receive the images of the player.
     done = record(place, 'node', '--node', f'exec {LIVE} -r image:=/elsewhere')
     assert done.returncode == 1
     assert done.stderr == ('record.py: error: node: 0 of 30 images came to anything, and nothing '

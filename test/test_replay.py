@@ -746,7 +746,7 @@ def test_zero_camera_info_loses_the_images_up_to_the_next_one(at, tmp_path):
     assert (found['complete'], found['frames']) == (True, FRAMES - 1)
     assert found['dropped'] == {'waiting_for_camera_info': 1}
     assert sum(found['rejected_infos'].values()) == 1
-    # What goes through the recording again has the cameras that the odometry had.
+    # A second pass over the recording has the cameras of the odometry.
     with open_recording(path) as recording:
         frame = frame_finder(recording, Config())(SECOND + 5 * SECOND // 10)
     assert frame.gray.shape == SIZE[::-1]

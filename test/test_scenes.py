@@ -149,7 +149,7 @@ def test_turning_on_the_spot_there_is_no_translation() -> None:
     assert np.degrees(np.arccos(poses[-1, 0, 0])) == pytest.approx(29)
 
 
-def test_the_loop_comes_by_the_same_place_twice() -> None:
+def test_the_loop_passes_the_same_place_twice() -> None:
     scene = make_scene('loop', size=TINY)
     poses = scene.trajectory(scene.path.limit)
     half = len(poses) // 2
@@ -175,7 +175,7 @@ def test_exposure_jumps_and_focus_is_lost_as_declared() -> None:
     assert sharpness[0] < 0.5 * sharpness[1]
 
 
-def test_under_water_it_is_dim_and_particles_drift_through_the_light() -> None:
+def test_underwater_images_are_dim_and_particles_drift_through_the_light() -> None:
     scene = make_scene('underwater', size=(240, 136))
     pose = scene.trajectory(1)[0]
     snow = replace(scene, effects=scene.effects[:2])
@@ -225,7 +225,7 @@ def test_a_folder_that_was_not_rendered_is_never_replaced(tmp_path: Path) -> Non
     ({'name': 'road', 'frames': 0, 'size': TINY}, "--frames is 0; scene 'road' has 1 to "),
     ({'name': 'road', 'frames': 10 ** 9, 'size': TINY}, '--frames is 1000000000'),
 ])
-def test_what_cannot_be_rendered_is_refused_in_one_line(
+def test_an_impossible_scene_is_refused_in_one_line(
         arguments: dict, message: str, tmp_path: Path) -> None:
     with pytest.raises(DjetError, match=message) as caught:
         render_sequence(out=tmp_path, **arguments)

@@ -102,7 +102,7 @@ def test_without_distortion_images_are_never_corrected() -> None:
 
 
 class Bent:
-    """A rendered turn that is seen through a lens of which the calibration knows nothing."""
+    """A rendered turn, seen through a lens with distortion that is not calibrated."""
 
     def __init__(self, k1: float, frames: int = 75) -> None:
         scene = make_scene('sharp_turn', 0, (620, 188))
@@ -164,7 +164,7 @@ def test_remaining_distortion_is_estimated_in_a_turn_and_reported(
 
 def test_the_back_end_gets_the_lens_of_each_image(
         tracked_bent: tuple[Tracker, list[OdometryResult]], tmp_path: Path) -> None:
-    """Live by messages, later by the results: loops are seen alike."""
+    """Loops are the same live, by messages, and later, by results."""
     _, results = tracked_bent
     lenses = [one.k1 for one in results]
     assert not any(lenses[:30])

@@ -380,7 +380,7 @@ def test_error_in_the_worker_thread_is_reported(live, drive):
     assert one.session.failed
 
 
-# What is said
+# Log messages
 
 def test_bad_images_are_logged_throttled_and_tracking_continues(live, drive):
     one = live()
@@ -521,7 +521,7 @@ def test_odometry_is_of_the_base_frame_once_tf_has_the_mounting(live, drive):
     assert np.allclose(pose_of(transform.transforms[0])[1], expected)
     assert (odometry.header.frame_id, odometry.child_frame_id) == ('odom', 'base_link')
     assert transform.transforms[0].child_frame_id == 'base_link'
-    # the camera goes ahead, and so does the vehicle
+    # the camera moves ahead, and so does the vehicle
     assert odometry.twist.twist.linear.x > 0
     assert one.graph.published('relative_pose')[-1].header.frame_id == 'camera_body'
 

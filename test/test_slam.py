@@ -80,7 +80,7 @@ def loop(true, source, target):
 
 @pytest.fixture(scope='module')
 def keyframes():
-    """Return what keeps keyframes of steps, and where each frame is; GTSAM must be installed."""
+    """Return the map of keyframes, and the pose of each frame; GTSAM must be installed."""
     pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
     from djet_ros.posegraph.keyframe_map import KeyframeMap
 
@@ -154,7 +154,7 @@ def test_the_covariance_of_a_keyframe_edge_is_that_of_its_steps(keyframes):
 
 
 def test_common_length_error_is_removed_from_single_lengths():
-    """A length known to 5 %, of which 1 % is its own, is as firm as one known to 1 %."""
+    """A length known to 5 %, of which 1 % is its own error, weighs as one known to 1 %."""
     motion = pose(x=0.3, z=2.0, yaw=0.1)
 
     def known_to(share):
@@ -275,7 +275,7 @@ def test_keyframes_without_features_get_no_votes(features):
 
 
 def test_votes_cover_all_keyframes(features):
-    """Also from those that were sorted into tables long ago, until they are forgotten."""
+    """Also among those added to the tables long ago, until they are removed."""
     places, few = index(), index(*features[:3]).votes(features[3], 3)
     for number in range(150):
         places.add(features[number % 3])
@@ -355,7 +355,7 @@ def test_loops_do_not_depend_on_the_keyframe_storage():
 
 
 def test_loops_are_found_over_a_step_back_in_time():
-    """A clock that was set back makes none of what was before later than what is now."""
+    """After a clock was set back, earlier keyframes do not count as later ones."""
     cards, finder, found = Cards(), EdgeFinder(EstimatorConfig(), SlamConfig(loop_gap=0.25)), []
     poses = [pose(x=0.5 * i) for i in (*range(4), *range(3, -1, -1))]
     edges = chain(np.array(poses)).edges

@@ -1,4 +1,4 @@
-"""The soak records what it promises, and its exit code reports growth."""
+"""The soak records its documented figures, and its exit code reports growth."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_a_leak_is_found() -> None:
     assert figures['growth_mb'] == pytest.approx(0.8 * 100 * 1.05, rel=0.3)
 
 
-def test_resident_memory_is_what_the_process_has() -> None:
+def test_resident_memory_is_that_of_the_process() -> None:
     before = resident_mb()
     # Of the system itself: the process may have room for an array that it was given before.
     with mmap(-1, 10 << 23) as block:
@@ -99,7 +99,7 @@ def test_resident_memory_is_what_the_process_has() -> None:
 @pytest.mark.parametrize(('arguments', 'message'), [
     (('--frames', 3), '--frames is 3; it must be at least 100'),
     ((), 'exists already; choose another name')])
-def test_what_can_be_mended_is_one_line_and_exit_code_2(
+def test_user_errors_are_one_line_and_exit_code_2(
         tmp_path: Path, arguments: tuple[object, ...], message: str) -> None:
     output = tmp_path / 'soak.json'
     if not arguments:

@@ -78,7 +78,7 @@ def test_the_first_step_is_the_unit_of_all_that_follow(cards):
     assert all(result.scale_kind is Scale.RELATIVE for result in results)
 
 
-def test_a_speed_of_zero_is_not_believed_while_images_show_motion(cards):
+def test_a_speed_of_zero_is_ignored_while_images_show_motion(cards):
     speeds = SpeedScale()
     for ns in range(0, 2 * 10**9, 10**8):
         speeds.add_speed(ns, 0.0)
@@ -347,7 +347,7 @@ def test_a_pair_with_other_depths_than_the_landmarks_disagrees(cards):
     assert scale.agrees(aside, pair.x[few], wrong[few]) is None
 
 
-def test_landmarks_seen_between_keyframes_contradict_other_depths_too(cards):
+def test_landmarks_observed_between_keyframes_contradict_other_depths_too(cards):
     """In slow motion only the first two frames are kept, though many confirmed their depths."""
     true_lengths = [pose(x=0.04)] * 7
     pair = Drive(cards).go(true_lengths)[-1].relative

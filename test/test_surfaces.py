@@ -84,7 +84,7 @@ def test_the_reference_point_stays_sub_pixel_though_its_descriptor_is_of_a_whole
 
 
 def test_references_between_pixels_reduce_the_bias_of_the_minimum():
-    """By parts of a pixel, which a fit around whole pixels is drawn away from."""
+    """By fractions of a pixel, from which a fit around whole pixels is biased."""
     # Without interpolation, which does not shift with the image.
     still = cv2.GaussianBlur(textured(np.random.default_rng(39), (320, 240)), (0, 0), 1.0)
     shift = np.array([3.375, -1.75])
@@ -109,7 +109,7 @@ def test_a_descriptor_surface_has_its_minimum_at_the_image_shift():
     x = grid.reshape(-1, 2).astype(float)
     shift = np.array([-2, 1])
     surface = DescriptorSurface(view(image), view(moved), x, EstimatorConfig())
-    y = x + shift + (1, -1)  # started beside the right place, the window follows the minimum
+    y = x + shift + (1, -1)  # started next to the minimum, the window follows it
     for _ in range(3):
         fitted, _ = resolve_indefinite(surface.fit_around(y), 'project')
         y = np.clip(fitted.minima(), y - 1, y + 1)

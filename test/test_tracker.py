@@ -286,7 +286,7 @@ def test_a_residual_distortion_gives_what_the_same_one_of_the_calibration_gives(
 
 # The status for a back end
 
-def test_the_status_of_each_frame_says_what_its_relative_pose_starts_from(drive):
+def test_the_status_of_each_frame_names_the_reference_of_its_relative_pose(drive):
     one = tracker(**{'odometry.max_lost': 2, 'odometry.scale': 'constant',
                      'odometry.scale_value': 1.0})
     black = np.zeros_like(drive[0])
@@ -313,7 +313,7 @@ def test_the_status_of_each_frame_says_what_its_relative_pose_starts_from(drive)
         (9, Status.OK, 8, True, False)]]
 
 
-def test_the_diagnostics_of_two_nodes_are_told_apart(drive):
+def test_the_diagnostics_of_two_nodes_are_distinguished(drive):
     for node in ('vo_node', 'left/vo_node'):
         one = Tracker(from_flat(FAST), message_type, node=node)
         one.camera_info(camera_info(K, SIZE))
@@ -465,7 +465,7 @@ def test_constant_stamps_are_reported_as_an_error(drive, stamp):
 
 
 @pytest.mark.parametrize('prepared', [False, True])
-def test_few_gray_levels_of_12_bits_are_reported_and_mended_by_the_range(drive, prepared):
+def test_few_gray_levels_of_12_bits_are_reported_and_corrected_by_the_range(drive, prepared):
     def sent(one, first):
         messages = [image(gray.astype('<u2') * 16, 'mono16', ns(0.1 * (first + i)))
                     for i, gray in enumerate(drive)]
@@ -533,7 +533,7 @@ def test_a_speed_that_is_missing_or_of_another_clock_is_reported_with_the_remedy
     assert problems_of(one) == ('OK', 'tracking', {})
 
 
-def test_ground_that_is_never_seen_is_reported(drive):
+def test_ground_that_is_never_visible_is_reported(drive):
     one = tracker(**{'odometry.scale': 'camera_height', 'odometry.camera_height': 1.0})
     play(one, [np.rot90(gray, 2) for gray in drive])
     assert 'no level ground' in problems_of(one)[2]['no metric length']
@@ -705,7 +705,7 @@ def test_a_path_continues_with_other_parameters_unless_they_name_other_frames(dr
     assert lengths == [2, 4, 2]
 
 
-def test_a_path_comes_on_demand_throttled_and_bounded(drive):
+def test_a_path_is_published_on_demand_throttled_and_bounded(drive):
     assert all('path' not in out for out in play(tracker(), drive[:3]))
     one = tracker(**{'ros.publish_path': True, 'ros.path_period': 0.25, 'ros.path_length': 4})
     out = play(one, drive[:8])
@@ -715,7 +715,7 @@ def test_a_path_comes_on_demand_throttled_and_bounded(drive):
     assert last == out[6]['odometry'].pose.pose.position
 
 
-def test_a_transform_comes_on_demand(drive):
+def test_a_transform_is_published_on_demand(drive):
     assert all('/tf' not in out for out in play(tracker(), drive[:2]))
     out = play(tracker(**{'ros.publish_tf': True}), drive[:2])[1]
     transform = out['/tf'].transforms[0]
@@ -807,7 +807,7 @@ SENT = st.sampled_from(['good', 'black', 'short', 'unknown', 'size', 'info', 'ze
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(SENT, st.integers(-10**9, 4 * 10**9)), max_size=12))
-def test_whatever_comes_in_whatever_order_every_image_is_accounted_for(events):
+def test_every_image_is_accounted_for_in_any_order_of_messages(events):
     one, sent = tracker(info=False), 0
     for what, stamp in events:
         if what == 'reset':
@@ -911,7 +911,7 @@ def test_diagnostics_exist_before_any_message():
     assert (diagnosis.level, diagnosis.summary) == ('WARN', 'waiting for camera_info')
 
 
-def test_the_rate_comes_from_stamps():
+def test_the_rate_is_that_of_the_stamps():
     rate = StampRate(frames=5)
     assert rate.hertz is None
     for i in range(20):

@@ -109,7 +109,7 @@ def test_a_wrong_tum_line_is_named(tmp_path, line, message):
         read_tum(tmp_path / 'a.tum')
 
 
-def test_of_a_line_that_the_disk_has_no_room_for_nothing_stays(tmp_path):
+def test_a_line_without_room_on_the_disk_is_removed(tmp_path):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     with TumWriter(tmp_path / 'full.txt') as writer:
         for i in range(20):

@@ -1,4 +1,4 @@
-"""Drift of the unit of lengths, as loops see it: circles that come out too large, and mended."""
+"""Drift of the unit of lengths: loops measure it, and circles that are too large are corrected."""
 
 from dataclasses import replace
 
@@ -162,7 +162,7 @@ def test_scale_ratio_from_depths():
 
 
 def test_edges_of_a_removed_keyframe_are_rescaled_to_its_successor(monkeypatch):
-    """In a map without an error no edge is off by what is forgotten, though the unit grows."""
+    """In a map without errors, no edge has one by removed keyframes, though the unit grows."""
     pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
     from djet_ros.posegraph import keyframe_map
     truth = circles()

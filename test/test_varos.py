@@ -1,4 +1,4 @@
-"""VAROS folders, in the layout that public programs read (the data set itself is not at hand)."""
+"""VAROS folders, in the layout that public programs read (not the data set itself)."""
 
 from pathlib import Path
 
@@ -33,7 +33,7 @@ def varos(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize('inner', ['.', 'vehicle0', 'vehicle0/cam0'])
-def test_a_varos_folder_is_known_by_what_it_holds(varos, inner):
+def test_a_varos_folder_is_recognised_by_its_contents(varos, inner):
     sequence = open_sequence(varos / inner)
     assert isinstance(sequence, VarosSequence)
     assert len(sequence) == 3

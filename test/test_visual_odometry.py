@@ -167,7 +167,7 @@ def drive_past(pictures):
     return [vo.process(Frame(gray, CLOSE_UP, (i + 1) * 10**8)) for i, gray in enumerate(pictures)]
 
 
-def test_after_too_many_bad_pairs_the_reference_is_given_up_and_the_pose_says_so(cards):
+def test_after_too_many_bad_pairs_the_reference_is_replaced_and_the_pose_uncertain(cards):
     results = drive(odometry(max_lost=2), cards,
                     [np.eye(4), STEP, None, None, STEP, STEP])
     assert [r.status.value for r in results[2:]] == [
@@ -179,7 +179,7 @@ def test_after_too_many_bad_pairs_the_reference_is_given_up_and_the_pose_says_so
     assert angles[5] > 1
 
 
-def test_a_camera_that_stands_still_has_no_motion_and_keeps_its_reference(cards):
+def test_a_stationary_camera_has_no_motion_and_keeps_its_reference(cards):
     vo = odometry()
     first, *still = (vo.process(cards.frame(0.1 * i, noise=i)) for i in range(4))
     for result in still:
@@ -192,7 +192,7 @@ def test_a_camera_that_stands_still_has_no_motion_and_keeps_its_reference(cards)
     assert moved.previous_stamp_ns == first.stamp_ns
 
 
-def test_the_velocity_after_a_standstill_is_that_of_the_motion_and_not_of_the_wait(cards):
+def test_the_velocity_after_a_standstill_excludes_the_wait(cards):
     scale, step = SpeedScale(), pose(x=0.25)
     for i in range(-1, 60):
         # 0.25 m from frame to frame once it starts
@@ -225,7 +225,7 @@ def test_the_same_image_twice_is_a_standstill_for_every_method(cards, method):
     assert vo.process(cards.frame(0.1)).stationary
 
 
-def test_pure_rotation_turns_the_pose_and_does_not_move_it(cards):
+def test_pure_rotation_rotates_the_pose_and_does_not_move_it(cards):
     results = drive(odometry(), cards, [np.eye(4), *[pose(yaw=0.02)] * 8])
     for i, result in enumerate(results[1:], 1):
         assert result.status is Status.NO_PARALLAX
@@ -244,7 +244,7 @@ def test_the_reference_is_kept_in_view_while_the_direction_is_undetermined(cards
     assert references == [0, 0, 0, 0, 4, 4, 4, 4]
 
 
-def test_a_motion_that_began_with_creep_lasts_since_the_standstill(cards):
+def test_a_motion_that_starts_with_creep_is_counted_from_the_standstill(cards):
     creeping = [pose(x=0.002)] * 20
     results = drive(odometry(ConstantScale(1.0)), cards, [*[np.eye(4)] * 10, *creeping])
     resting = results[9].stamp_ns

@@ -27,7 +27,7 @@ _BORDER, _SURE = 15, 1e-4
 
 class Street:
     """
-    Points (N, 3) beside and on a street, seen from a camera that moves one metre per frame.
+    Points (N, 3) next to and on a street, seen from a camera that moves one metre per frame.
 
     noise: pixels, of each observation; turned: rad, error of each pair's rotation; curve: rad,
     rotation of the street per metre from the thirtieth to the ninetieth; k1: distortion of the
@@ -64,7 +64,7 @@ class Street:
         return places, near & inside(places)
 
     def pair(self, frame: int, count: int = 700) -> tuple[NDArray[np.int64], RelativePose]:
-        """Points (M,) that a frame and the next have matched, and what they tell: the truth."""
+        """Points (M,) that a frame and the next one match, and the true pair by them."""
         (x, here), (y, there) = self.seen(frame), self.seen(frame + 1)
         which = self.rng.permutation(np.flatnonzero(here & there))[:count]
         R = self.turn(frame + 1) @ self.turn(frame).T
@@ -77,7 +77,7 @@ class Street:
 
 
 class NumbersWindow(Window):
-    """A window that is given where points are, instead of measuring them in images."""
+    """A window that is given the positions of points, instead of measuring them in images."""
 
     def __init__(self, street: Street, unit: float = 1.0) -> None:
         super().__init__(EstimatorConfig())
@@ -100,7 +100,7 @@ class NumbersWindow(Window):
         return self.added.length
 
     def correct_images(self, newest: Any) -> None:
-        """Go on with a lens that has so much less of k1, and points where that shows them."""
+        """Continue with images corrected by some k1, and points where these show them."""
         before, undone = self._landmarks.anchor_pixels, self.lens.corrected_k1
         super().correct_images(newest)
         moved = undistort(K, distort(K, before, undone), self.lens.corrected_k1)
@@ -176,7 +176,7 @@ def test_noise_does_not_bias_the_scale() -> None:
 
 @pytest.mark.parametrize('unit', [0.002, 50.0])
 def test_a_track_is_the_same_in_any_unit(unit: float) -> None:
-    """The first step makes it: one of a vehicle that moves off, or one of metres."""
+    """The first step defines it: one of a vehicle that starts, or one of metres."""
     as_they_are, in_units = (
         [window.go() for _ in range(60)]
         for window in (NumbersWindow(Street(0, 60, 0.3)), NumbersWindow(Street(0, 60, 0.3), unit)))

@@ -1,4 +1,4 @@
-"""What a user meets who starts the node where no ROS is."""
+"""The error message of a node started without ROS."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PATHS = [path for path in sys.path if not (Path(path) / 'rclpy').exists()]
 @pytest.mark.parametrize('node', ['vo_node', 'pose_graph_node'])
 @pytest.mark.parametrize('arguments', [
     [], ['--help'], ['--ros-args', '-r', 'image:=/camera/image']])
-def test_the_nodes_say_in_one_line_what_is_missing(
+def test_the_nodes_name_in_one_line_the_missing_module(
         tmp_path: Path, arguments: list[str], node: str) -> None:
     program = (f'import sys; sys.path[:] = {json.dumps(PATHS)}; '
                f'from djet_ros.cli.nodes import {node}; sys.exit({node}())')
