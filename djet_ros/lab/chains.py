@@ -32,9 +32,9 @@ Image = NDArray[np.uint8]
 
 _POINTS = 2000
 _RATIO = 0.85
-_APART, _QUALITY = 8, 0.01
+_MIN_DISTANCE, _QUALITY = 8, 0.01
 _WINDOW, _LEVELS = 11, 5
-_THERE_AND_BACK = 1.0
+_MAX_ROUND_TRIP = 1.0
 _THRESHOLD = 1.0
 # Fewest matches for an estimate: more than the 5-point method needs for one hypothesis.
 _MIN_MATCHES = 8
@@ -89,35 +89,35 @@ def mutual_neighbours(previous: Points, current: Points) -> tuple[Array, Array]:
     squares = np.maximum(2 - 2 * previous.descriptors @ current.descriptors.T, 0)
     nearest = squares.argmin(axis=1)
     first, second = np.partition(squares, 1, axis=1)[:, :2].T
-    kept = squares.argmin(axis=0)[nearest] == np.arange(len(nearest))
-    kept &= first < _RATIO ** 2 * second
-    return (previous.places[kept].astype(np.float64),
-            current.places[nearest[kept]].astype(np.float64))
+    mutual = squares.argmin(axis=0)[nearest] == np.arange(len(nearest))
+    mutual &= first < _RATIO ** 2 * second
+    return (previous.places[mutual].astype(np.float64),
+            current.places[nearest[mutual]].astype(np.float64))
 
 
 def corners(gray: Image, mask: Mask | None = None) -> Points:
     """Find up to 2000 corners by Shi and Tomasi at least 8 pixels apart, outside a mask (H, W)."""
-    found = cv2.goodFeaturesToTrack(gray, _POINTS, _QUALITY, _APART, mask=_allowed(mask))
-    places = np.asarray([] if found is None else found, np.float32).reshape(-1, 2)
+    detected = cv2.goodFeaturesToTrack(gray, _POINTS, _QUALITY, _MIN_DISTANCE, mask=_allowed(mask))
+    places = np.asarray([] if detected is None else detected, np.float32).reshape(-1, 2)
     return Points(gray, places, np.empty((len(places), 0), np.float32))
 
 
 def tracked(previous: Points, current: Points) -> tuple[Array, Array]:
-    """Track corners forward and back by Lucas and Kanade's pyramids; keep who returns to 1 px."""
+    """Track corners by pyramids of Lucas and Kanade; keep those tracked back to within 1 px."""
     if not len(previous.places):
         return np.empty((0, 2)), np.empty((0, 2))
-    there, seen = _flow(previous.image, current.image, previous.places)
-    back, seen_back = _flow(current.image, previous.image, there)
-    kept = seen & seen_back
-    kept &= np.linalg.norm(back - previous.places, axis=1) <= _THERE_AND_BACK
-    return previous.places[kept].astype(np.float64), there[kept].astype(np.float64)
+    moved, found = _flow(previous.image, current.image, previous.places)
+    back, found_back = _flow(current.image, previous.image, moved)
+    returned = found & found_back
+    returned &= np.linalg.norm(back - previous.places, axis=1) <= _MAX_ROUND_TRIP
+    return previous.places[returned].astype(np.float64), moved[returned].astype(np.float64)
 
 
 def _flow(before: Image, after: Image, places: NDArray[np.float32]
           ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    found, seen, _ = cv2.calcOpticalFlowPyrLK(before, after, places[:, None], np.empty(0),
-                                              winSize=(_WINDOW, _WINDOW), maxLevel=_LEVELS)
-    return np.asarray(found, np.float32).reshape(-1, 2), seen.ravel() > 0
+    tracked, status, _ = cv2.calcOpticalFlowPyrLK(before, after, places[:, None], np.empty(0),
+                                                  winSize=(_WINDOW, _WINDOW), maxLevel=_LEVELS)
+    return np.asarray(tracked, np.float32).reshape(-1, 2), status.ravel() > 0
 
 
 def _allowed(mask: Mask | None) -> Image | None:

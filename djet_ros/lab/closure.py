@@ -54,7 +54,7 @@ def closures(sequence: FrameSequence, methods: Sequence[str], frames: int,
     if frames < 3:
         raise DjetError(f'{frames} frames are too few for a triplet; at least three are needed')
     estimators = {name: TwoViewEstimator(preset('best', method=name)) for name in methods}
-    found: dict[str, list[Triangle | None]] = {name: [] for name in methods}
+    triangles: dict[str, list[Triangle | None]] = {name: [] for name in methods}
     # All methods share the features: detection does not depend on the method.
     detector = estimators[methods[0]]
     a, b = (sequence.frame(i).view(detector) for i in (0, 1))
@@ -63,19 +63,19 @@ def closures(sequence: FrameSequence, methods: Sequence[str], frames: int,
         c = sequence.frame(first + 2).view(detector)
         for name, one in estimators.items():
             after = one.estimate(b, c, before[name])
-            across = one.estimate(a, c, before[name])
-            found[name].append(_triangle(first, before[name], after, across, sequence.poses))
+            direct = one.estimate(a, c, before[name])
+            triangles[name].append(_triangle(first, before[name], after, direct, sequence.poses))
             before[name] = after
         a, b = b, c
         progress(first + 1)
-    return found
+    return triangles
 
 
-def _triangle(first: int, before: RelativePose, after: RelativePose, across: RelativePose,
+def _triangle(first: int, before: RelativePose, after: RelativePose, direct: RelativePose,
               poses: Array | None) -> Triangle | None:
-    if any(one.status is not Status.OK for one in (before, after, across)):
+    if any(one.status is not Status.OK for one in (before, after, direct)):
         return None
-    closure, covariance = closure_rotation(before, after, across)
+    closure, covariance = closure_rotation(before, after, direct)
     return Triangle(
         first, float(np.degrees(np.linalg.norm(closure))),
         float(np.degrees(np.sqrt(np.trace(covariance)))),
@@ -84,15 +84,15 @@ def _triangle(first: int, before: RelativePose, after: RelativePose, across: Rel
 
 
 def closure_rotation(before: RelativePose, after: RelativePose,
-                     across: RelativePose) -> tuple[Array, Array]:
+                     direct: RelativePose) -> tuple[Array, Array]:
     """
     Return the rotation vector (3,) of the closure error in rad, and its covariance (3, 3).
 
     before, after: motions from the first to the second view, and from the second to the third;
     across: from the first to the third. Their errors are taken to be independent.
     """
-    closure = Rotation.from_matrix(across.R @ (after.R @ before.R).T).as_rotvec()
-    C_before, C_after, C_across = (one.covariance_5[:3, :3] for one in (before, after, across))
+    closure = Rotation.from_matrix(direct.R @ (after.R @ before.R).T).as_rotvec()
+    C_before, C_after, C_across = (one.covariance_5[:3, :3] for one in (before, after, direct))
     return closure, C_across + C_after + after.R @ C_before @ after.R.T
 
 

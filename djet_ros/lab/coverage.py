@@ -229,14 +229,15 @@ def draw_reliability(records: Sequence[Coverage], path: Path) -> None:
     scenes = list(dict.fromkeys(record.scene for record in records))
     with figure(path, 9.0, 4.0) as empty:
         left, right = empty.subplots(1, 2)
-        for number, scene in enumerate(scenes):
+        for index, scene in enumerate(scenes):
             squares = np.sort([r.square for r in records if r.scene == scene and r.has_nees])
             if not len(squares):
                 continue
-            claimed, found = chi2.cdf(squares, 5), np.arange(1, len(squares) + 1) / len(squares)
-            look = {'label': f'{scene} ({len(squares)})', 'color': colormaps['tab20'](number % 20)}
-            left.step(claimed, found, where='post', **look)
-            right.step(np.maximum(chi2.sf(squares, 5), 1e-6), 1 - found + 1 / len(squares), **look)
+            claimed, observed = chi2.cdf(squares, 5), np.arange(1, len(squares) + 1) / len(squares)
+            style = {'label': f'{scene} ({len(squares)})', 'color': colormaps['tab20'](index % 20)}
+            left.step(claimed, observed, where='post', **style)
+            right.step(np.maximum(chi2.sf(squares, 5), 1e-6), 1 - observed + 1 / len(squares),
+                       **style)
         left.plot([0, 1], [0, 1], 'k:', lw=1)
         right.plot([1e-6, 1], [1e-6, 1], 'k:', lw=1)
         left.set(xlabel='probability of the ellipsoid', ylabel='share of poses inside',

@@ -71,28 +71,30 @@ def fit_imu(rotations: VisualRotations, stamps_ns: NDArray[np.int64], rates: Arr
     offset; robust least squares on the rotations of the pairs then estimate all three. Raises
     DjetError if there are too few pairs, or their rotations do not determine the offset.
     """
-    seen = rotations.rates()
-    if len(seen) < _LEAST_PAIRS or seen.std(0).max() < _LEAST_CHANGE:
-        raise DjetError(f'{len(seen)} pairs whose angular rates vary by {seen.std(0).max():.3f} '
-                        f'rad/s do not determine an offset; record at least {_LEAST_PAIRS}, and '
-                        'rotate the camera back and forth about all axes')
+    visual = rotations.rates()
+    if len(visual) < _LEAST_PAIRS or visual.std(0).max() < _LEAST_CHANGE:
+        raise DjetError(f'{len(visual)} pairs whose angular rates vary by '
+                        f'{visual.std(0).max():.3f} rad/s do not determine an offset; record at '
+                        f'least {_LEAST_PAIRS}, and rotate the camera back and forth about all '
+                        'axes')
     gyro = _orientations(stamps_ns, rates)
-    R, bias, offset, known = _initial_fit(rotations, seen, gyro, widest)
-    at_first = np.array([0, 0, 0, *bias, offset])
+    R, bias, offset, known = _initial_fit(rotations, visual, gyro, widest)
+    initial = np.array([0, 0, 0, *bias, offset])
 
     def residuals(z: Array) -> Array:
         # Unknowns are scaled and start at one, so that relative steps suit all of them.
-        x = at_first + _UNITS * (z - 1)
-        there, covered = _gyro_rates(rotations, gyro, x[6])
-        off = seen - (Rotation.from_rotvec(x[:3]) * R).apply(there - x[3:6])
-        return np.asarray(np.where((covered & known)[:, None], off, 0.0).ravel())
+        x = initial + _UNITS * (z - 1)
+        measured, covered = _gyro_rates(rotations, gyro, x[6])
+        differences = visual - (Rotation.from_rotvec(x[:3]) * R).apply(measured - x[3:6])
+        return np.asarray(np.where((covered & known)[:, None], differences, 0.0).ravel())
 
     first = residuals(np.ones(7))
     scale = max(1.4826 * float(np.median(np.abs(first[first != 0]))), 1e-5)
-    found = least_squares(residuals, np.ones(7), loss='cauchy', f_scale=2 * scale, diff_step=0.01)
-    x = at_first + _UNITS * (found.x - 1)
-    sigma = 1.4826 * float(np.median(np.abs(found.fun[found.fun != 0])))
-    information = found.jac.T @ found.jac
+    solution = least_squares(residuals, np.ones(7), loss='cauchy', f_scale=2 * scale,
+                             diff_step=0.01)
+    x = initial + _UNITS * (solution.x - 1)
+    sigma = 1.4826 * float(np.median(np.abs(solution.fun[solution.fun != 0])))
+    information = solution.jac.T @ solution.jac
     if np.linalg.cond(information) > _DEGENERATE:
         raise DjetError('the rotations do not determine the offset; rotate the camera back and '
                         'forth about all axes')
@@ -101,19 +103,20 @@ def fit_imu(rotations: VisualRotations, stamps_ns: NDArray[np.int64], rates: Arr
                   sigma, int(known.sum()))
 
 
-def _initial_fit(rotations: VisualRotations, seen: Array, gyro: Slerp, widest: float
+def _initial_fit(rotations: VisualRotations, visual: Array, gyro: Slerp, widest: float
                  ) -> tuple[Rotation, Array, float, NDArray[np.bool_]]:
     """Return rotation, bias, offset, and which pairs (N,) the IMU covers at that offset."""
-    tried = np.arange(-widest, widest + _COARSE / 2, _COARSE)
-    offset = float(tried[np.argmin([_misfit(rotations, seen, gyro, one) for one in tried])])
+    candidates = np.arange(-widest, widest + _COARSE / 2, _COARSE)
+    misfits = [_misfit(rotations, visual, gyro, one) for one in candidates]
+    offset = float(candidates[np.argmin(misfits)])
     measured, known = _gyro_rates(rotations, gyro, offset)
     if known.sum() < _LEAST_PAIRS:
-        raise DjetError(f'the IMU covers {known.sum()} of {len(seen)} pairs, at least '
+        raise DjetError(f'the IMU covers {known.sum()} of {len(visual)} pairs, at least '
                         f'{_LEAST_PAIRS} are needed; check that images and IMU are stamped by '
                         'synchronised clocks, or raise --widest')
-    R, _ = Rotation.align_vectors(seen[known] - np.median(seen[known], axis=0),
+    R, _ = Rotation.align_vectors(visual[known] - np.median(visual[known], axis=0),
                                   measured[known] - np.median(measured[known], axis=0))
-    bias = np.median(measured[known] - R.inv().apply(seen[known]), axis=0)
+    bias = np.median(measured[known] - R.inv().apply(visual[known]), axis=0)
     return R, bias, offset, known
 
 
@@ -126,11 +129,11 @@ def _orientations(stamps_ns: NDArray[np.int64], rates: Array) -> Slerp:
                         'all of them finite; name a recording with complete IMU data')
     h = np.diff(stamps)[:, None] * 1e-9
     steps = Rotation.from_rotvec(h * (rates[:-1] + rates[1:]) / 2).as_matrix()
-    turned = np.empty((len(stamps), 3, 3))
-    turned[0] = np.eye(3)
+    orientations = np.empty((len(stamps), 3, 3))
+    orientations[0] = np.eye(3)
     for i, step in enumerate(steps):
-        turned[i + 1] = turned[i] @ step
-    return Slerp(stamps * 1e-9, Rotation.from_matrix(turned))
+        orientations[i + 1] = orientations[i] @ step
+    return Slerp(stamps * 1e-9, Rotation.from_matrix(orientations))
 
 
 def _gyro_rates(rotations: VisualRotations, gyro: Slerp, offset: float
@@ -145,12 +148,12 @@ def _gyro_rates(rotations: VisualRotations, gyro: Slerp, offset: float
     return rates, known
 
 
-def _misfit(rotations: VisualRotations, seen: Array, gyro: Slerp, offset: float) -> float:
+def _misfit(rotations: VisualRotations, visual: Array, gyro: Slerp, offset: float) -> float:
     """Return the median difference of the rates, infinite without overlap of the recordings."""
     measured, known = _gyro_rates(rotations, gyro, offset)
     if known.sum() < _LEAST_PAIRS:
         return np.inf
     # After a linear map, which absorbs rotation and bias.
     A = np.column_stack([measured[known], np.ones(known.sum())])
-    left = seen[known] - A @ np.linalg.lstsq(A, seen[known], rcond=None)[0]
+    left = visual[known] - A @ np.linalg.lstsq(A, visual[known], rcond=None)[0]
     return float(np.median(np.linalg.norm(left, axis=1)))

@@ -102,7 +102,7 @@ def run_drive(chunk: DriveChunk, config: EstimatorConfig) -> list[Drive]:
     cv2.setNumThreads(1)
     scene = make_scene(chunk.scene, chunk.seed, chunk.size)
     poses = scene.trajectory(chunk.frames)
-    alone = VisualOdometry(config)
+    visual = VisualOdometry(config)
     metric = VisualOdometry(config, OdometryConfig(scale='camera_height', camera_height=HEIGHT))
     ground = np.zeros(scene.size[::-1], bool)
     ground[int(_HORIZON * len(ground)):] = True
@@ -110,32 +110,33 @@ def run_drive(chunk: DriveChunk, config: EstimatorConfig) -> list[Drive]:
     for index, pose in enumerate(poses):
         gray, stamp = scene.render(pose, index), round(index * FRAME_PERIOD * 1e9)
         covered = _LEAD <= index < _LEAD + chunk.hidden
-        results[0].append(alone.process(Frame(gray, scene.K, stamp)))
+        results[0].append(visual.process(Frame(gray, scene.K, stamp)))
         results[1].append(metric.process(Frame(
             gray, scene.K, stamp, left_out=ground if covered else None)))
     return [drive_results(chunk, poses, *results)]
 
 
-def drive_results(chunk: DriveChunk, truth: Array, alone: Sequence[OdometryResult],
+def drive_results(chunk: DriveChunk, truth: Array, visual: Sequence[OdometryResult],
                   metric: Sequence[OdometryResult]) -> Drive:
     """Compare two runs over the same frames with true poses (N, 4, 4)."""
-    found = np.array([result.pose for result in alone])
-    unit = path_scale(found[:, :3, 3], truth[:, :3, 3])
-    found[:, :3, 3] *= unit
-    drifted = drift(truth, found)
+    poses = np.array([result.pose for result in visual])
+    unit = path_scale(poses[:, :3, 3], truth[:, :3, 3])
+    poses[:, :3, 3] *= unit
+    drifted = drift(truth, poses)
     hidden = slice(_LEAD, _LEAD + chunk.hidden)
     steps, true_steps = (np.linalg.norm(np.diff(path[:, :3, 3], axis=0), axis=1)[hidden]
                          for path in (np.array([result.pose for result in metric]), truth))
-    segments = [segment_squares(truth, alone, metres) for metres in SEGMENTS_M]
-    rotations, poses = ([_median(squares[which], degrees) for squares in segments]
-                        for which, degrees in ((0, 3), (1, 6)))
+    segments = [segment_squares(truth, visual, metres) for metres in SEGMENTS_M]
+    rotations, pose_medians = ([_median(squares[kind], degrees) for squares in segments]
+                               for kind, degrees in ((0, 3), (1, 6)))
     return Drive(
-        chunk.scene, chunk.seed, len(truth), sum(one.status in TRACKED for one in alone),
-        scale_change(found[:, :3, 3], truth[:, :3, 3]),
+        chunk.scene, chunk.seed, len(truth), sum(one.status in TRACKED for one in visual),
+        scale_change(poses[:, :3, 3], truth[:, :3, 3]),
         drifted.translation_percent if drifted else float('nan'),
         drifted.rotation_deg_per_100m if drifted else float('nan'),
-        _median(step_squares(truth, alone), 1),
-        rotations[0], rotations[1], rotations[2], poses[0], poses[1], poses[2],
+        _median(step_squares(truth, visual), 1),
+        rotations[0], rotations[1], rotations[2],
+        pose_medians[0], pose_medians[1], pose_medians[2],
         float(steps.sum() / true_steps.sum()) if chunk.hidden and true_steps.any()
         else float('nan'))
 
@@ -180,35 +181,36 @@ def segment_squares(truth: Array, results: Sequence[OdometryResult], metres: flo
     Segments start at every tenth frame. Their scale is that of the steps before the start, whose
     variance is included: scale drift before a segment is not its error.
     """
-    gone = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1)))
+    distances = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1)))
     squares = []
     for first in range(_EVERY, len(truth), _EVERY):
-        last = int(np.searchsorted(gone, gone[first] + metres))
+        last = int(np.searchsorted(distances, distances[first] + metres))
         if last >= len(truth):
             break
-        pose, path = _integrated(results[first:last + 1], *_unit_before(first, gone, results))
+        pose, path = _integrated(results[first:last + 1], *_unit_before(first, distances, results))
         true = np.linalg.inv(truth[first]) @ truth[last]
-        off = np.concatenate([true[:3, 3] - pose[:3, 3],
-                              rotation_log(true[:3, :3] @ pose[:3, :3].T)])
-        squares.append([off[3:] @ np.linalg.solve(path.pose[3:, 3:], off[3:]),
-                        off @ np.linalg.solve(path.pose, off)])
+        errors = np.concatenate([true[:3, 3] - pose[:3, 3],
+                                 rotation_log(true[:3, :3] @ pose[:3, :3].T)])
+        squares.append([errors[3:] @ np.linalg.solve(path.pose[3:, 3:], errors[3:]),
+                        errors @ np.linalg.solve(path.pose, errors)])
     rotations, poses = np.array(squares).reshape(-1, 2).T
     return rotations, poses
 
 
-def _unit_before(first: int, gone: Array, results: Sequence[OdometryResult]
+def _unit_before(first: int, distances: Array, results: Sequence[OdometryResult]
                  ) -> tuple[float, float, float]:
     """Return (log scale, its variance, variance of the scale's walk) of the steps to a frame."""
     before = [index for index in range(first - _EVERY + 1, first + 1)
-              if _length(results[index]) > 0 and gone[index] > gone[index - 1]]
+              if _length(results[index]) > 0 and distances[index] > distances[index - 1]]
     if not before:
         return 0.0, 0.0, 0.0
-    logs = [np.log((gone[index] - gone[index - 1]) / _length(results[index])) for index in before]
+    logs = [np.log((distances[index] - distances[index - 1]) / _length(results[index]))
+            for index in before]
     wandered = np.array([_walk_variance(results[index]) for index in before])
-    here = _walk_variance(results[first])
-    own = sum(_own_sigma(results[index])**2 for index in before) / len(before)**2
+    current = _walk_variance(results[first])
+    variance = sum(_own_sigma(results[index])**2 for index in before) / len(before)**2
     # The variance of a mean of random walks is two thirds of the mean of their variances.
-    return float(np.mean(logs)), own + 2 / 3 * float((here - wandered).mean()), here
+    return float(np.mean(logs)), variance + 2 / 3 * float((current - wandered).mean()), current
 
 
 def _integrated(results: Sequence[OdometryResult], unit: float, variance: float, wandered: float

@@ -40,9 +40,9 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
     holds all edges, including those that the robust kernel rejected.
     """
     frames, graph = slam.frames, slam.optimised.graph
-    ways = {'before': slam.odometry_poses(), 'after': slam.optimised_poses()}
-    for which, poses in ways.items():
-        StampedTrajectory(frames.stamps_ns, poses).write_tum(folder / f'{which}_tum.txt')
+    trajectories = {'before': slam.odometry_poses(), 'after': slam.optimised_poses()}
+    for label, poses in trajectories.items():
+        StampedTrajectory(frames.stamps_ns, poses).write_tum(folder / f'{label}_tum.txt')
     for kind in ('g2o', 'csv'):
         write_graph(graph, folder / f'pose_graph.{kind}', kind)
     values = flat(config)
@@ -60,11 +60,11 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
     if known.sum() > 2:
         StampedTrajectory(frames.stamps_ns[known], truth[known]).write_tum(
             folder / 'truth_tum.txt')
-        summary['errors'] = {which: _error(poses, truth, slam.metric)
-                             for which, poses in ways.items()}
+        summary['errors'] = {label: _error(poses, truth, slam.metric)
+                             for label, poses in trajectories.items()}
         try:
-            for which, errors in summary['errors'].items():
-                errors.update(_evo(folder, which, slam.metric))
+            for label, errors in summary['errors'].items():
+                errors.update(_evo(folder, label, slam.metric))
         except DjetError as error:
             # evo is not installed, or fails on a straight trajectory.
             summary['evo'] = str(error)
@@ -74,29 +74,30 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
 
 
 def _error(poses: Array, truth: Array, scaled: bool) -> dict[str, float]:
-    there = truth[:, :3, 3]
-    return {'ape_m': position_rmse(aligned(poses[:, :3, 3], there, scaled), there)}
+    positions = truth[:, :3, 3]
+    return {'ape_m': position_rmse(aligned(poses[:, :3, 3], positions, scaled), positions)}
 
 
-def _evo(folder: Path, which: str, scaled: bool) -> dict[str, float]:
+def _evo(folder: Path, label: str, scaled: bool) -> dict[str, float]:
     """Return the metrics of a trajectory file by evo."""
-    metrics = trajectory_metrics(folder / 'truth_tum.txt', folder / f'{which}_tum.txt', scaled)
+    metrics = trajectory_metrics(folder / 'truth_tum.txt', folder / f'{label}_tum.txt', scaled)
     return {f'evo_{name}': value for name, value in asdict(metrics).items()}
 
 
 def _plot(path: Path, slam: Slam, truth: Array | None, title: str) -> None:
     """Plot the trajectory from above, before and after, and both errors over time."""
-    ways = {'before': slam.odometry_poses()[:, :3, 3], 'after': slam.optimised_poses()[:, :3, 3]}
+    trajectories = {'before': slam.odometry_poses()[:, :3, 3],
+                    'after': slam.optimised_poses()[:, :3, 3]}
     if truth is not None:
-        ways = {which: aligned(way, truth[:, :3, 3], slam.metric)
-                for which, way in ways.items()}
+        trajectories = {label: aligned(positions, truth[:, :3, 3], slam.metric)
+                        for label, positions in trajectories.items()}
     with figure(path, 7 if truth is None else 12, 6) as page:
         axes = page.add_subplot(1, 1 if truth is None else 2, 1, aspect='equal')
         if truth is not None:
             axes.plot(truth[:, 0, 3], truth[:, 2, 3], color='0.6', lw=3, label='ground truth')
-        for which, way in ways.items():
-            axes.plot(way[:, 0], way[:, 2], label=which, **_LINES[which])
-        if len(closed := _closed(slam, ways['after'])):
+        for label, positions in trajectories.items():
+            axes.plot(positions[:, 0], positions[:, 2], label=label, **_LINES[label])
+        if len(closed := _closed(slam, trajectories['after'])):
             axes.plot(*closed[:, [0, 2]].T, '.', color=COLOURS['pjet'], ms=4, label='loop closed')
         unit = 'm' if slam.metric or truth is not None else 'units'
         axes.set(xlabel=f'x, right ({unit})', ylabel=f'z, forward ({unit})', title=title)
@@ -104,16 +105,16 @@ def _plot(path: Path, slam: Slam, truth: Array | None, title: str) -> None:
         if truth is not None:
             errors = page.add_subplot(1, 2, 2)
             seconds = (slam.frames.stamps_ns - slam.frames.stamps_ns[0]) * 1e-9
-            for which, way in ways.items():
-                errors.plot(seconds, np.linalg.norm(way - truth[:, :3, 3], axis=1), label=which,
-                            **_LINES[which])
+            for label, positions in trajectories.items():
+                errors.plot(seconds, np.linalg.norm(positions - truth[:, :3, 3], axis=1),
+                            label=label, **_LINES[label])
             errors.set(xlabel='time (s)', ylabel='position error after alignment (m)')
             errors.legend()
 
 
-def _closed(slam: Slam, way: Array) -> Array:
+def _closed(slam: Slam, positions: Array) -> Array:
     """Return the positions (L, 3), among those of all frames (N, 3), of accepted loop edges."""
     _, first = np.unique([offset.keyframe for offset in slam.offsets], return_index=True)
     closing = [edge.source for edge, trust in zip(slam.optimised.graph.edges, slam.optimised.trust)
                if edge.kind == 'loop' and trust >= 0.5]
-    return np.asarray(way[first[np.array(closing, np.int64)]])
+    return np.asarray(positions[first[np.array(closing, np.int64)]])

@@ -184,24 +184,24 @@ _ABREAST = 3
 def _build_traffic(seed: int, size: tuple[int, int]) -> Scene:
     """Stand at a street with lorries from both sides."""
     spot, rng = _on_the_spot(0.0), np.random.default_rng([seed, 6])
-    panels, here = truck(rng), spot.pose(0)
+    panels, camera = truck(rng), spot.pose(0)
     begins = rng.uniform(0, 20, len(_CROSSINGS))
     movers = tuple(
-        Mover(panels, partial(_crossing, here, ahead, speed, gap, begin + number * gap))
-        for (ahead, speed, gap), begin in zip(_CROSSINGS, begins) for number in range(_ABREAST))
+        Mover(panels, partial(_crossing, camera, ahead, speed, gap, begin + index * gap))
+        for (ahead, speed, gap), begin in zip(_CROSSINGS, begins) for index in range(_ABREAST))
     return _street_scene('traffic', seed, size, spot,
                          World(_road_world(seed, True).panels, movers))
 
 
-def _crossing(here: Array, ahead: float, speed: float, gap: float, begin: float, index: int
+def _crossing(camera: Array, ahead: float, speed: float, gap: float, begin: float, index: int
               ) -> Array:
     """Return the pose (4, 4) of a lorry of a line that wraps around out of sight."""
     length = _ABREAST * gap
-    across = (begin + abs(speed) * index) % length - length / 2
-    way = level_pose(across if speed > 0 else -across, ahead, np.copysign(np.pi / 2, speed))
-    ground = here.copy()
+    sideways = (begin + abs(speed) * index) % length - length / 2
+    lorry = level_pose(sideways if speed > 0 else -sideways, ahead, np.copysign(np.pi / 2, speed))
+    ground = camera.copy()
     ground[1, 3] = 0.0
-    return np.asarray(ground @ way)
+    return np.asarray(ground @ lorry)
 
 
 @lru_cache(maxsize=1)

@@ -104,7 +104,7 @@ def floor(plan: Plan, palette: Palette) -> list[Panel]:
 def corridor(plan: Plan, palette: Palette, rng: np.random.Generator) -> list[Panel]:
     """Everything above the floor."""
     cells = set(plan.cells)
-    taken = set(cells)
+    occupied = set(cells)
     panels: list[Panel] = []
     for cell in plan.cells:
         middle = level_pose(cell[0] * CELL, cell[1] * CELL, 0.0)
@@ -113,8 +113,8 @@ def corridor(plan: Plan, palette: Palette, rng: np.random.Generator) -> list[Pan
             beyond = cell[0] + right, cell[1] + ahead
             if beyond in cells:
                 continue
-            open_ = beyond not in taken and rng.random() < 0.25
-            taken |= {beyond} if open_ else set()
+            open_ = beyond not in occupied and rng.random() < 0.25
+            occupied |= {beyond} if open_ else set()
             side = _doorway(palette, rng) if open_ else _wall(palette, rng)
             panels += placed(side, _wall_pose(cell, quarter))
     return panels
@@ -138,8 +138,8 @@ def _ceiling(palette: Palette) -> list[Panel]:
 def _wall(palette: Palette, rng: np.random.Generator) -> list[Panel]:
     """Make a closed side of a cell at z = 0, looking to -z, with one thing or another on it."""
     half = CELL / 2
-    things = (_door, _pictures, _window, _board, _bench, _nothing)
-    kind = things[int(rng.choice(len(things), p=(0.3, 0.2, 0.15, 0.1, 0.1, 0.15)))]
+    furnishings = (_door, _pictures, _window, _board, _bench, _nothing)
+    kind = furnishings[int(rng.choice(len(furnishings), p=(0.3, 0.2, 0.15, 0.1, 0.1, 0.15)))]
     wall = fitted((-half, -HEIGHT, 0), (CELL, 0, 0), (0, HEIGHT, 0), palette.wall,
                   gain=rng.uniform(0.95, 1.06))
     rails = [(-half, half)] if kind is not _door else [(-half, -0.7), (0.7, half)]

@@ -144,9 +144,9 @@ def _undergrowth(route: Route, ground: _Ground, palette: _Palette,
             texture = textures[int(rng.integers(len(textures)))]
             foot = np.array([x, ground.at(x, z) + 0.06 * size, z])
             for angle in (turn, turn + np.pi / 2):
-                across = size * np.array([np.cos(angle), 0, np.sin(angle)])
-                panels.append(fitted(foot - across / 2 - (0, size, 0), across, (0, size, 0),
-                                     texture, gain=rng.uniform(0.7, 1.25)))
+                horizontal = size * np.array([np.cos(angle), 0, np.sin(angle)])
+                panels.append(fitted(foot - horizontal / 2 - (0, size, 0), horizontal,
+                                     (0, size, 0), texture, gain=rng.uniform(0.7, 1.25)))
     return panels
 
 

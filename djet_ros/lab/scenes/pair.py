@@ -41,13 +41,13 @@ class ScenePair:
         """
         depth, inside = _depth_at(self.depth_previous, points)
         rays = np.concatenate([points, np.ones((len(points), 1))], 1) @ np.linalg.inv(self.K).T
-        there = (depth[:, None] * rays) @ self.R.T + self.t
+        moved = (depth[:, None] * rays) @ self.R.T + self.t
         with np.errstate(divide='ignore', invalid='ignore'):
-            pixels = (there @ self.K.T)[:, :2] / there[:, 2:]
+            pixels = (moved @ self.K.T)[:, :2] / moved[:, 2:]
         pixels = np.where(np.isfinite(pixels), pixels, -1.0)
-        found, inside_there = _depth_at(self.depth_current, pixels)
-        hidden = np.abs(found / there[:, 2] - 1) > _SAME_SURFACE
-        return pixels, inside & inside_there & ~hidden & (there[:, 2] > 0)
+        depth_current, inside_current = _depth_at(self.depth_current, pixels)
+        hidden = np.abs(depth_current / moved[:, 2] - 1) > _SAME_SURFACE
+        return pixels, inside & inside_current & ~hidden & (moved[:, 2] > 0)
 
 
 def _depth_at(depth: Gray, points: Array) -> tuple[Array, NDArray[np.bool_]]:

@@ -63,8 +63,8 @@ class PanelsInView:
     nearest: Array
 
 
-def look(panels: PanelArrays, pose: Array, K: Array, raster: Raster,
-         reach: float = np.inf) -> PanelsInView:
+def project_panels(panels: PanelArrays, pose: Array, K: Array, raster: Raster,
+                   reach: float = np.inf) -> PanelsInView:
     """
     Project panels into the camera of pose (4, 4), camera to world, and sort them by depth.
 
@@ -76,10 +76,10 @@ def look(panels: PanelArrays, pose: Array, K: Array, raster: Raster,
     normal = np.cross(a, b)
     volume = (normal * origin).sum(1)
     # A camera in the plane of a panel sees an edge without width.
-    seen = np.abs(volume) > 1e-9 * np.linalg.norm(normal, axis=1)
-    seen &= (boxes[:, 0] < boxes[:, 1]) & (boxes[:, 2] < boxes[:, 3])
-    seen &= nearest > 1 / reach
-    index = np.flatnonzero(seen)
+    visible_panels = np.abs(volume) > 1e-9 * np.linalg.norm(normal, axis=1)
+    visible_panels &= (boxes[:, 0] < boxes[:, 1]) & (boxes[:, 2] < boxes[:, 3])
+    visible_panels &= nearest > 1 / reach
+    index = np.flatnonzero(visible_panels)
     if len(index) > np.iinfo(np.int16).max:
         raise ValueError(f'{len(index)} panels are in view; at most 32767 can be told apart')
     inverse = np.stack([np.cross(b, origin), np.cross(origin, a), normal], axis=1)[index]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from djet_ros.lab.scenes.camera import Shot
 from djet_ros.lab.scenes.panel import PanelArrays, World
-from djet_ros.lab.scenes.raster import look, Raster, shade, visible
+from djet_ros.lab.scenes.raster import project_panels, Raster, shade, visible
 from djet_ros.lab.scenes.texture import Gray
 import numpy as np
 
@@ -42,7 +42,7 @@ class Gloss:
         """Return the radiance (H, W) of the mirrored world."""
         rows, columns = shot.radiance.shape
         raster = Raster((columns, rows), 1)
-        view = look(upside_down(self.above.at(shot.index)), shot.pose, shot.K, raster)
+        view = project_panels(upside_down(self.above.at(shot.index)), shot.pose, shot.K, raster)
         return shade(view, visible(view, raster)[0], raster, 0.0)
 
 

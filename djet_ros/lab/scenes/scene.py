@@ -9,7 +9,7 @@ from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.lab.scenes.camera import Effect, Shot
 from djet_ros.lab.scenes.panel import World
-from djet_ros.lab.scenes.raster import look, PanelsInView, Raster, reduce, shade, visible
+from djet_ros.lab.scenes.raster import PanelsInView, project_panels, Raster, reduce, shade, visible
 from djet_ros.lab.scenes.route import Trajectory
 from djet_ros.lab.scenes.texture import Gray
 import numpy as np
@@ -79,7 +79,7 @@ class Scene:
 
     def _look(self, level: Array, index: int, factor: int) -> tuple[PanelsInView, Raster]:
         raster = Raster(self.size, factor)
-        return look(self.world.at(index), level, self.K, raster, self.reach), raster
+        return project_panels(self.world.at(index), level, self.K, raster, self.reach), raster
 
     def _expose(self, pose: Array, index: int) -> Shot:
         """Return the radiance at the camera before all effects."""

@@ -93,7 +93,7 @@ def _houses(route: Route, rng: np.random.Generator, palette: things.Palette,
             side: int) -> list[Panel]:
     """Rows of houses that look at the street and do not stand in one another or on the road."""
     panels: list[Panel] = []
-    taken = np.full((1, 2), np.inf)
+    occupied = np.full((1, 2), np.inf)
     s = 0.0
     while s < route.length:
         width, gap, front = (rng.uniform((9, 0.6, 8.8), (15, 6, 11.5)) if palette.varied
@@ -102,11 +102,11 @@ def _houses(route: Route, rng: np.random.Generator, palette: things.Palette,
         pose = level_pose(point[0], point[1], float(heading) + side * np.pi / 2)
         corners = (_footprint(width) @ pose.T)[:, ::2]
         centre = corners.mean(0)
-        free = (np.linalg.norm(taken - centre, axis=1).min() > 0.8 * width
+        free = (np.linalg.norm(occupied - centre, axis=1).min() > 0.8 * width
                 and route.distance(corners).min() > _CLEARANCE)
         if free:
             panels += placed(things.house(rng, palette, width), pose)
-            taken = np.concatenate([taken, centre[None]])
+            occupied = np.concatenate([occupied, centre[None]])
         s += width + gap if free else 3.0
     return panels
 

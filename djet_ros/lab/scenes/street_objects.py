@@ -102,8 +102,8 @@ def tree(rng: np.random.Generator, palette: Palette) -> list[Panel]:
     turn, gain = rng.uniform(0, np.pi), rng.uniform(0.7, 1.2)
     panels = []
     for angle in turn + np.arange(3) * np.pi / 3:
-        across = width * np.array([np.cos(angle), 0, np.sin(angle)])
-        panels.append(fitted(-across / 2 - (0, height, 0), across, (0, height, 0), texture,
+        horizontal = width * np.array([np.cos(angle), 0, np.sin(angle)])
+        panels.append(fitted(-horizontal / 2 - (0, height, 0), horizontal, (0, height, 0), texture,
                              gain=gain * (0.85 + 0.15 * np.cos(angle))))
     return panels
 

@@ -25,8 +25,8 @@ def road(rng: np.random.Generator) -> Texture:
     image += 8 * np.cos(2 * np.pi * (x - 1.4) / 1.6) * (np.abs(x) < 3)
     _edge_lines(image, rng, x, metres)
     walk = 150 + 14 * fractal(rng, shape, 0.8) + _paving(rng, shape, metres)
-    aside = np.abs(x) > HALF_LANE
-    image[:, aside] = walk[:, aside]
+    beyond_lane = np.abs(x) > HALF_LANE
+    image[:, beyond_lane] = walk[:, beyond_lane]
     image[:, np.abs(np.abs(x) - HALF_LANE) < 0.1] += 45
     image[:, np.abs(np.abs(x) - HALF_LANE + 0.2) < 0.1] -= 45
     image -= 55 * _shade(fractal(rng, shape, 1.6))
@@ -96,10 +96,10 @@ def _opening(image: Gray, rng: np.random.Generator, place: float, top: float,
     x_scale, y_scale = image.shape[1] / metres[0], image.shape[0] / metres[1]
     width, height = (1.1, 2.2) if door else (1.15, 1.5)
     left = round(place * image.shape[1] - width / 2 * x_scale)
-    upper = round(top * image.shape[0] + (0.8 if door else 0.75) * y_scale)
+    upper_edge = round(top * image.shape[0] + (0.8 if door else 0.75) * y_scale)
 
     def box(x0: float, y0: float, x1: float, y1: float, value: float) -> None:
-        corners = [(left + round(x * x_scale), upper + round(y * y_scale))
+        corners = [(left + round(x * x_scale), upper_edge + round(y * y_scale))
                    for x, y in ((x0, y0), (x1, y1))]
         cv2.rectangle(image, corners[0], corners[1], float(value), -1)
 
