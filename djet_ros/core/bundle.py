@@ -466,6 +466,14 @@ class Reduced:
                                      self._slopes + self._coupling[:, :, self._lens:] @ step))
 
 
+def _by_poses(observed: Observed, by_frame: Array, by_anchor: Array, frames: int) -> Array:
+    """Return the Jacobians (M, 2, 6 F) of observations by all poses, by those by two."""
+    count = len(by_frame)
+    rows, by_poses = np.arange(count), np.zeros((count, 2, frames, 6))
+    by_poses[rows, :, observed.frame], by_poses[rows, :, observed.anchor] = by_frame, by_anchor
+    return by_poses.reshape(count, 2, 6 * frames)
+
+
 def eliminate(observed: Observed, weights: Array, weight: float, frames: int,
               lens: bool = False) -> Reduced:
     """
@@ -486,13 +494,9 @@ def eliminate(observed: Observed, weights: Array, weight: float, frames: int,
     root = np.sqrt(weights)[:, None, None]
     by_frame, by_anchor = linear.by_frame * root, linear.by_anchor * root
     e, back = observed.residuals * root[:, 0], (linear.by_own * root).transpose(0, 2, 1)
-    J = np.zeros((count, 2, size))
-    rows, by_poses = np.arange(count), np.zeros((count, 2, frames, 6))
-    by_poses[rows, :, observed.frame], by_poses[rows, :, observed.anchor] = by_frame, by_anchor
-    J[:, :, lens:] = by_poses.reshape(count, 2, 6 * frames)
     by_k1 = linear.by_k1[:, :, None] * root
-    J[:, :, :lens] = by_k1[:, :, :lens]
-    flat = J.reshape(-1, size)
+    flat = np.concatenate([by_k1[:, :, :lens], _by_poses(observed, by_frame, by_anchor, frames)],
+                          axis=2).reshape(-1, size)
     H, g = flat.T @ flat, flat.T @ e.ravel()
     points_by_own, points_by_k1 = linear.points_by_own, linear.points_by_k1
     information, slopes = np.tile(np.eye(3) * _DEPTH_INFORMATION, (n, 1, 1)), np.zeros((n, 3))

@@ -207,8 +207,8 @@ class Camera:
         rays = np.linalg.inv(self.K) @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
         # Overflow counts as not seen.
         with np.errstate(all='ignore'):
-            seen, _ = self.pixels(np.asarray(rays[:2].T), self.k1)
-        inside = ((seen >= 0) & (seen < (width, height))).all(axis=1)
+            pixels, _ = self.pixels(np.asarray(rays[:2].T), self.k1)
+        inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
         inside &= ~folded[y.astype(int), x.astype(int)].ravel()
         if inside.mean() < _LEAST_SEEN:
             raise BadMessage('bad_calibration', (
@@ -291,12 +291,12 @@ def check_lens(K: Array, size: tuple[int, int]) -> None:
     side = max(size)
     if not side:
         return
-    focal, off = np.diag(K)[:2], K[:2, 2] - np.array(size) / 2
+    focal, offset = np.diag(K)[:2], K[:2, 2] - np.array(size) / 2
     if not ((_SHORTEST * side <= focal) & (focal <= _LONGEST * side)).all():
         raise BadMessage('bad_calibration', (
             f'no lens has focal lengths of {focal[0]:g} and {focal[1]:g} pixels for an image of '
             f'{size[0]}x{size[1]}; {_CALIBRATE}'))
-    if not (np.abs(off) <= _FARTHEST * side).all():
+    if not (np.abs(offset) <= _FARTHEST * side).all():
         raise BadMessage('bad_calibration', (
             f'the principal point {K[0, 2]:g}, {K[1, 2]:g} is far off an image of '
             f'{size[0]}x{size[1]} pixels; {_CALIBRATE}'))

@@ -292,9 +292,9 @@ class CameraHeightScale(ScaleSource):
         x, P = self._predicted(start_ns, end_ns)
         # The interval of lengths that the filter predicts, in heights: four sigma to both sides.
         expected = (x[0] + np.array([-4, 4]) * np.sqrt(P[0, 0])) * seconds / self._height
-        seen = self._ground_of(current).motion(
+        motion = self._ground_of(current).motion(
             previous, current, relative, (float(expected[0]), float(expected[1])))
-        if seen is not None and self._update(*self._measured(seen, seconds), x, P):
+        if motion is not None and self._update(*self._measured(motion, seconds), x, P):
             self._seen_ns = end_ns
             self._turn(relative, seconds)
 
@@ -334,19 +334,19 @@ class CameraHeightScale(ScaleSource):
             gaps[1:] = abs(start_ns - self._seen_ns)
         return self._x, self._P + np.diag(_WANDERING**2 * gaps * 1e-9)
 
-    def _measured(self, seen: GroundMotion, seconds: float) -> tuple[Array, Array]:
+    def _measured(self, motion: GroundMotion, seconds: float) -> tuple[Array, Array]:
         """Return speed, pitch and roll (3,) and their covariance, roughness of ground included."""
         scale = np.array([self._height / seconds, 1.0, 1.0])
-        return seen.value * scale, seen.covariance * np.outer(scale, scale) + np.diag(
+        return motion.value * scale, motion.covariance * np.outer(scale, scale) + np.diag(
             [0.0, _UNEVEN**2, _UNEVEN**2])
 
     def _update(self, z: Array, R: Array, x: Array, P: Array) -> bool:
         """Update a prediction x, P by a measurement z, R; return whether it is no outlier."""
-        off, S = z - x, P + R
-        if off[1:] @ np.linalg.solve(S[1:, 1:], off[1:]) > _OUTLIER:
+        innovation, S = z - x, P + R
+        if innovation[1:] @ np.linalg.solve(S[1:, 1:], innovation[1:]) > _OUTLIER:
             # No road is tilted against the camera by that much.
             return False
-        if off[0]**2 > _OUTLIER * S[0, 0]:
+        if innovation[0]**2 > _OUTLIER * S[0, 0]:
             # The measurement overrules the model of how speed changes.
             P = P.copy()
             P[0] = P[:, 0] = 0.0

@@ -230,9 +230,9 @@ class KeyframeMap:
             keyframe.pose, keyframe.factor = pose, factor
         self.rejected_loops = optimised.rejected('loop')
         newest = self.newest.keyframe - self.first
-        here = self.keyframes[newest].pose @ rescaled_motion(
+        newest_pose = self.keyframes[newest].pose @ rescaled_motion(
             self.newest.motion, float(optimised.factors[newest]))
-        self.correction = here @ np.linalg.inv(self._newest_step.pose)
+        self.correction = newest_pose @ np.linalg.inv(self._newest_step.pose)
         self.optimisations += 1
         return optimised
 

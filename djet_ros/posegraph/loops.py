@@ -112,9 +112,9 @@ class EdgeFinder:
 
         units: whether to estimate the ratio of the units at both ends, see ``log_scale_ratio``.
         """
-        config, here = self._config, current - self._first
-        latest = self._times[here] - config.loop_gap * 1e9
-        before = self._first + bisect_left(self._times, latest, hi=here)
+        config, index = self._config, current - self._first
+        latest = self._times[index] - config.loop_gap * 1e9
+        before = self._first + bisect_left(self._times, latest, hi=index)
         votes = self._places.votes(self._kept[current].features, before)
         votes[:self._first] = 0
         best = np.argsort(-votes, kind='stable')[:config.loop_candidates]

@@ -90,26 +90,26 @@ class _Block:
             # A block has fewer than 2^16 descriptors.
             self._tables.append((keys[order], order.astype(np.uint16)))
 
-    def votes(self, asking: NDArray[np.uint8]) -> Index:
+    def votes(self, descriptors: NDArray[np.uint8]) -> Index:
         """Return how many of the descriptors (N, 32) have a similar one in each keyframe."""
-        mine, found = self._bucket_mates(asking)
-        near = _ONES[asking[mine] ^ self._descriptors[found]].sum(1) <= _MAX_DISTANCE
+        queries, matches = self._bucket_mates(descriptors)
+        near = _ONES[descriptors[queries] ^ self._descriptors[matches]].sum(1) <= _MAX_DISTANCE
         # One vote per feature and keyframe, however many similar descriptors there are.
         size = self.end - self.first
-        cast = np.unique(mine[near] * size + self._owner[found[near]])
+        cast = np.unique(queries[near] * size + self._owner[matches[near]])
         return np.bincount(cast % size, minlength=size)
 
-    def _bucket_mates(self, asking: NDArray[np.uint8]) -> tuple[Index, Index]:
+    def _bucket_mates(self, descriptors: NDArray[np.uint8]) -> tuple[Index, Index]:
         """Return the index pairs of query and block descriptors that share a bucket."""
         pairs = []
-        for keys, (ordered, order) in zip(_keys(asking), self._tables):
+        for keys, (ordered, order) in zip(_keys(descriptors), self._tables):
             start = np.searchsorted(ordered, keys)
             size = np.searchsorted(ordered, keys, 'right') - start
             within = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
-            pairs.append((np.repeat(np.arange(len(asking)), size),
+            pairs.append((np.repeat(np.arange(len(descriptors)), size),
                           order[np.repeat(start, size) + within]))
-        mine, found = (np.concatenate(part) for part in zip(*pairs))
-        return mine, found
+        queries, matches = (np.concatenate(part) for part in zip(*pairs))
+        return queries, matches
 
 
 def _keys(descriptors: NDArray[np.uint8]) -> Iterator[NDArray[np.uint16]]:

@@ -26,7 +26,7 @@ def transferred_length(step: RelativePose, other: RelativePose, length: Length,
     A point seen in both pairs has one depth, so its inverse depths in units of the translations
     are proportional to their lengths. Unknown if too few points are shared.
     """
-    estimated = _ratio(_Depths.here(step, K), _Depths.here(other, K))
+    estimated = _ratio(_Depths.in_first_view(step, K), _Depths.in_first_view(other, K))
     if estimated is None:
         return unknown(length.value)
     ratio, sigma = estimated
@@ -49,21 +49,21 @@ def log_scale_ratio(step: RelativePose, step_length: float, loop: RelativePose,
     * Points shared by the loop and one other pair give the loop's length, once in each unit. They
       are many, but hardly determine it if the loop is short.
     """
-    near, far = _Depths.here(step, K), _Depths.here(other, K)
-    here = _Depths.here(loop, K)
-    there = here.there(loop, K)
+    near, far = _Depths.in_first_view(step, K), _Depths.in_first_view(other, K)
+    first = _Depths.in_first_view(loop, K)
+    second = first.in_second_view(loop, K)
     estimates = []
-    at_near, at_far = _ratio(near, here), _ratio(far, there)
+    at_near, at_far = _ratio(near, first), _ratio(far, second)
     if at_near is not None and at_far is not None:
         estimates.append((np.log(at_near[0] * step_length / (at_far[0] * other_length)),
                           np.hypot(at_near[1] / at_near[0], at_far[1] / at_far[0])))
-    mine, others = _shared(near, here)
-    inverse = _from(near.inverse[mine] / step_length, here.x[others], loop.R,
+    in_step, in_loop = _shared(near, first)
+    inverse = _from(near.inverse[in_step] / step_length, first.x[in_loop], loop.R,
                     loop_length * loop.t, K)
-    both = _ratio(_Depths(there.x[others], inverse, near.parallax[mine]),
-                  far.of(far.parallax > _MIN_PARALLAX))
-    if both is not None:
-        estimates.append((np.log(both[0] / other_length), both[1] / both[0]))
+    by_length = _ratio(_Depths(second.x[in_loop], inverse, near.parallax[in_step]),
+                       far.of(far.parallax > _MIN_PARALLAX))
+    if by_length is not None:
+        estimates.append((np.log(by_length[0] / other_length), by_length[1] / by_length[0]))
     if not estimates:
         return None
     ratio, sigma = min(estimates, key=lambda estimate: float(estimate[1]))
@@ -82,7 +82,7 @@ class _Depths(NamedTuple):
     parallax: Array
 
     @classmethod
-    def here(cls, pair: RelativePose, K: Array) -> _Depths:
+    def in_first_view(cls, pair: RelativePose, K: Array) -> _Depths:
         """Return the depths of the inliers in the pair's first view."""
         x = pair.x[pair.inliers]
         rays_x, rays_y = rays(K, x), rays(K, pair.y_opt[pair.inliers])
@@ -90,7 +90,7 @@ class _Depths(NamedTuple):
         parallax = np.linalg.norm(np.cross(rays_y, rays_x @ pair.R.T), axis=1)
         return cls(x, inverse, parallax / (rays_y**2).sum(1))
 
-    def there(self, pair: RelativePose, K: Array) -> _Depths:
+    def in_second_view(self, pair: RelativePose, K: Array) -> _Depths:
         """Return the depths of the same points in the pair's second view."""
         return _Depths(pair.y[pair.inliers], _from(self.inverse, self.x, pair.R, pair.t, K),
                        self.parallax)
@@ -108,9 +108,9 @@ def _from(inverse: Array, x: Array, R: Array, t: Array, K: Array) -> Array:
 
 def _shared(first: _Depths, second: _Depths) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return two index arrays (S,) of the points with the same pixels."""
-    _, mine, others = np.intersect1d(_pixel_keys(first.x), _pixel_keys(second.x),
-                                     return_indices=True)
-    return mine, others
+    _, first_indices, second_indices = np.intersect1d(_pixel_keys(first.x), _pixel_keys(second.x),
+                                                      return_indices=True)
+    return first_indices, second_indices
 
 
 def _pixel_keys(points: Array) -> NDArray[np.int64]:
@@ -119,16 +119,16 @@ def _pixel_keys(points: Array) -> NDArray[np.int64]:
     return np.asarray(columns + (rows << 20))
 
 
-def _ratio(sure: _Depths, others: _Depths) -> tuple[float, float] | None:
+def _ratio(reference: _Depths, others: _Depths) -> tuple[float, float] | None:
     """
-    Return the ratio of others' inverse depths to those of the same points, and its sigma.
+    Return the ratio of others' inverse depths to the reference of the same points, with sigma.
 
-    Only points with sufficient parallax in sure are used; None if they are too few.
+    Only points with sufficient parallax in the reference are used; None if they are too few.
     """
-    mine, theirs = _shared(sure, others)
-    x, parallax = sure.x[mine], sure.parallax[mine]
+    reference_indices, other_indices = _shared(reference, others)
+    x, parallax = reference.x[reference_indices], reference.parallax[reference_indices]
     with np.errstate(divide='ignore', invalid='ignore'):
-        ratios = others.inverse[theirs] / sure.inverse[mine]
+        ratios = others.inverse[other_indices] / reference.inverse[reference_indices]
     used = (parallax > _MIN_PARALLAX) & np.isfinite(ratios)
     if used.sum() < _MIN_SHARED:
         return None

@@ -15,10 +15,10 @@ def aligned(estimate: Array, truth: Array, scaled: bool = True) -> Array:
     """
     known = np.isfinite(truth).all(axis=1)
     centre, goal = estimate[known].mean(0), truth[known].mean(0)
-    here, there = estimate[known] - centre, truth[known] - goal
-    U, D, Vt = np.linalg.svd(there.T @ here)
+    centred, centred_truth = estimate[known] - centre, truth[known] - goal
+    U, D, Vt = np.linalg.svd(centred_truth.T @ centred)
     S = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    spread = float((here**2).sum())
+    spread = float((centred**2).sum())
     scale = 1.0 if scaled or not spread else float((D * S).sum()) / spread
     return np.asarray(scale * (estimate - centre) @ ((U * S) @ Vt).T + goal)
 

@@ -64,8 +64,8 @@ def drift(truth: Array, estimate: Array) -> Drift | None:
 
 def path_scale(places: Array, truth: Array) -> float:
     """Return the factor that scales a path (N, 3) to the true one (N, 3), by their spread."""
-    here, there = (np.linalg.norm(path - path.mean(0)) for path in (places, truth))
-    return float(there / here) if here > 0 else 1.0
+    spread, true_spread = (np.linalg.norm(path - path.mean(0)) for path in (places, truth))
+    return float(true_spread / spread) if spread > 0 else 1.0
 
 
 def scale_change(places: Array, truth: Array) -> float:
@@ -75,24 +75,24 @@ def scale_change(places: Array, truth: Array) -> float:
     Scales are ratios of summed step lengths. 1 without scale drift; NaN if the path stands still
     in one of the two, or the true path altogether.
     """
-    here, there = (np.linalg.norm(np.diff(path, axis=0), axis=1) for path in (places, truth))
-    way = np.cumsum(there)
+    steps, true_steps = (np.linalg.norm(np.diff(path, axis=0), axis=1) for path in (places, truth))
+    distances = np.cumsum(true_steps)
     # At least one step each: the one in which the first tenth ends or the last begins.
-    first, last = way - there <= 0.1 * way[-1], way >= 0.9 * way[-1]
-    begun, ended = here[first].sum(), here[last].sum()
-    if min(begun, ended) <= _STANDSTILL_RATIO * max(begun, ended) or not there.any():
+    first, last = distances - true_steps <= 0.1 * distances[-1], distances >= 0.9 * distances[-1]
+    start, end = steps[first].sum(), steps[last].sum()
+    if min(start, end) <= _STANDSTILL_RATIO * max(start, end) or not true_steps.any():
         return float('nan')
-    return float(ended / there[last].sum() / (begun / there[first].sum()))
+    return float(end / true_steps[last].sum() / (start / true_steps[first].sum()))
 
 
 def _segments(places: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.int64]]:
     """Return first and last frames (M,) and lengths (M,) of all segments of a path (N, 3)."""
-    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1)))
+    distances = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1)))
     first, length = (grid.ravel() for grid in np.meshgrid(
         np.arange(0, len(places), _EVERY), LENGTHS, indexing='ij'))
-    last = np.searchsorted(way, way[first] + length, side='right')
-    there = last < len(places)
-    return first[there], last[there], length[there]
+    last = np.searchsorted(distances, distances[first] + length, side='right')
+    complete = last < len(places)
+    return first[complete], last[complete], length[complete]
 
 
 def _between(poses: Array, first: NDArray[np.intp], last: NDArray[np.intp]) -> Array:
