@@ -563,6 +563,23 @@ def test_an_only_camera_info_serves_an_only_camera(tmp_path):
     assert 'no camera_info in the namespace of /b/image; to use /a/camera_info' in problem
 
 
+def test_an_auxiliary_topic_is_found_or_named_or_its_lack_has_a_remedy(tmp_path):
+    path = record(tmp_path / 'bag', [*camera_messages(2), ('/people', image(2), SECOND)])
+    named = BagRecording(path, '/cam/image_raw', auxiliary={'mask': '/people'})
+    with named as source:
+        assert source.auxiliary == {'mask': '/people'}
+    for what, name, problem in (
+            ('mask', None, "has no single topic for 'mask'; choose one with --mask-topic from: "
+             '/people'),
+            ('mask', '/animals', "has no topic '/animals' for 'mask'; choose one with "
+             '--mask-topic from: /people'),
+            ('speed', None, "has no topic for 'speed' (geometry_msgs/msg/TwistStamped or "
+             'nav_msgs/msg/Odometry); record one, or set the parameters so that none is needed'),
+            ('tf', None, 'has no topic /tf, which odometry.guess_frame requires')):
+        assert problem in source_error(path, image_topic='/cam/image_raw',
+                                       auxiliary={what: name})
+
+
 def test_ground_truth_is_found_by_its_name(tmp_path):
     path = record(tmp_path / 'bag', [*camera_messages(2), ('/groundtruth', pose(1), SECOND),
                                      ('/estimate', pose(1), SECOND)])

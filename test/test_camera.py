@@ -241,6 +241,7 @@ def test_an_image_of_another_size_is_refused():
     with pytest.raises(BadMessage, match='image is 100x120') as caught:
         Camera.from_info(camera_info(K, SIZE), False).undistort(np.zeros((120, 100), np.uint8))
     assert caught.value.reason == 'size_mismatch'
+    assert 'remap camera_info, --info-topic' in str(caught.value)
 
 
 def test_a_camera_info_without_a_size_takes_any_image():

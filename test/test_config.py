@@ -81,9 +81,10 @@ def test_plain_and_ros_layout_read_alike(tmp_path):
     assert plain == ros == from_flat({'estimator.method': 'rpe', 'ros.qos_depth': 7})
 
 
-def test_float_in_exponent_notation_without_a_point_is_read(tmp_path):
-    config = load_yaml(written(tmp_path, 'odometry: {scale_value: 1e-3}'))
-    assert config.odometry.scale_value == 1e-3
+def test_float_may_be_a_string_as_yaml_reads_an_exponent_without_a_point_as_one(tmp_path):
+    for text in ('1e-3', "'0.001'"):
+        config = load_yaml(written(tmp_path, f'odometry: {{scale_value: {text}}}'))
+        assert config.odometry.scale_value == 1e-3
 
 
 def test_explicit_values_override_the_preset():
@@ -125,6 +126,8 @@ def test_number_lists_may_be_strings_or_lists(tmp_path, values):
     ('estimator.loop_gap', 1.0, "did you mean 'slam.loop_gap'"),
     ('ros.path_perod', 1.0, "did you mean 'ros.path_period'"),
     ('slam.path_perod', 1.0, "did you mean 'slam.path_period'"),
+    ('odomtry.zzz', 1, "did you mean the section 'odometry'"),
+    ('odometry.zzz', 1, "unknown parameter 'odometry.zzz'$"),
     ('zzzzzz', 1, "unknown parameter 'zzzzzz'$"),
     ('nonsense', 1, "unknown parameter 'nonsense'$"),
     ('slam.links', 'two', r'slam\.links is .two.; it must be of type int'),
@@ -162,6 +165,27 @@ def test_invalid_parameter_file_is_refused_in_one_line(tmp_path, text):
         load_yaml(path)
     assert str(caught.value).startswith(str(path))
     assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize(('text', 'message'), [
+    ('odometry: [1, 2]', "'odometry' is a section and has no value; set its parameters, such as "
+     'odometry.max_gap'),
+    ('odometry: []', "'odometry' is a section"),
+    ('odomtry: {max_gap: 2}', "unknown parameter 'odomtry.max_gap'; did you mean "
+     "'odometry.max_gap'?"),
+    ('odomtry:', "unknown parameter 'odomtry'; did you mean the section 'odometry'?"),
+    ('vo_node: {ros__parameters: {odomtry: {max_gap: 2}}}', "did you mean 'odometry.max_gap'?"),
+    ('/**: {odometry: {max_gap: 2}}', "unknown parameter '/**.odometry'; a file with names of "
+     "nodes needs ros__parameters between them and 'odometry'"),
+    ('odometry: {max_gap: {a: 1}}', "odometry.max_gap is {'a': 1}; it must be of type float")])
+def test_mistaken_sections_are_named_with_what_was_meant(tmp_path, text, message):
+    with pytest.raises(DjetError) as caught:
+        load_yaml(written(tmp_path, text))
+    assert message in str(caught.value)
+
+
+def test_empty_sections_change_nothing(tmp_path):
+    assert load_yaml(written(tmp_path, 'odometry:\nestimator: {}\n')) == Config()
 
 
 def test_missing_huge_and_binary_files_are_refused(tmp_path):

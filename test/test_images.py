@@ -188,6 +188,12 @@ def test_a_broken_image_has_a_reason(changes, expected):
     assert reason(image(GRAY, **changes)) == expected
 
 
+@pytest.mark.parametrize('changes', [{'height': 37}, {'step': 51}])
+def test_an_image_that_contradicts_itself_has_a_remedy(changes):
+    with pytest.raises(BadMessage, match='in the node that publishes it, or choose another image'):
+        gray_image(image(GRAY, **changes))
+
+
 @settings(max_examples=200, deadline=None)
 @given(encoding=st.one_of(st.sampled_from(ENCODINGS), st.text(max_size=5)),
        size=st.tuples(*[st.integers(0, 40) | st.integers(0, 2**32 - 1)] * 3),

@@ -963,6 +963,26 @@ def test_metric_scale_without_measurements_gives_a_warning(tmp_path):
         assert re.search(r'scale\W+relative, in units of the first step', done.stdout)
 
 
+def test_scale_source_that_begins_late_gives_a_warning_of_mixed_units(tmp_path):
+    """At 2.5 Hz a speed counts for the images up to half a second before it."""
+    def slower(stamp):
+        return SECOND + 4 * (stamp - SECOND)
+
+    def messages(first):
+        for topic, message, stamp in with_speeds():
+            message.header = header(slower(stamp))
+            if topic != '/wheel' or slower(stamp) >= first:
+                yield topic, message, slower(stamp)
+
+    for first, said in ((SECOND, ''), (26 * SECOND // 10, (
+            'djet: warning: the trajectory mixes units: its first 3 lengths are relative, those '
+            'from stamp 2.600000000 on are metric; start the source of odometry.scale before the '
+            'images, or use only the part after that stamp\n'))):
+        done = djet('replay', record(tmp_path / f'{first}', messages(first)), '--output',
+                    tmp_path / f'{first}r', '--scale', 'speed')
+        assert done.stderr == said
+
+
 def test_topics_are_for_bags(folder):
     with pytest.raises(DjetError, match='not a bag'):
         open_recording(folder, image_topic='/camera')

@@ -86,13 +86,27 @@ def from_flat(values: Mapping[str, Any]) -> Config:
 
 def why_unknown(name: str) -> str:
     """Return the error text for an unknown parameter, suggesting the most similar name."""
-    def similarity(full: str) -> tuple[float, float]:
-        return (_ratio(full.rpartition('.')[2], str(name).rpartition('.')[2]),
-                _ratio(full, str(name)))
+    if name in SECTIONS:
+        of_it = next(one for one in flat(Config()) if one.startswith(f'{name}.'))
+        return f"'{name}' is a section and has no value; set its parameters, such as {of_it}"
+    return f"unknown parameter '{name}'{_hint(name)}"
 
+
+def _hint(name: str) -> str:
+    """Return what was probably meant by the name of an unknown parameter, or ''."""
+    def similarity(full: str) -> tuple[float, float]:
+        return _ratio(full.rpartition('.')[2], last), _ratio(full, name)
+
+    first, last = name.partition('.')[0], name.rpartition('.')[2]
     nearest = max(flat(Config()), key=similarity)
-    hint = f"; did you mean '{nearest}'?" if similarity(nearest)[0] > _MISSPELLING_RATIO else ''
-    return f"unknown parameter '{name}'{hint}"
+    if similarity(nearest)[0] > _MISSPELLING_RATIO:
+        return f"; did you mean '{nearest}'?"
+    if last in SECTIONS:
+        return f"; a file with names of nodes needs ros__parameters between them and '{last}'"
+    part = max(SECTIONS, key=lambda one: _ratio(one, first))
+    if first not in SECTIONS and _ratio(part, first) > _MISSPELLING_RATIO:
+        return f"; did you mean the section '{part}'?"
+    return ''
 
 
 def _ratio(a: str, b: str) -> float:

@@ -130,14 +130,15 @@ def is_ros_own(name: str) -> bool:
 
 
 def _flatten(content: Any) -> Iterator[tuple[str, Any]]:
-    """Yield flat names and values; only known sections are entered, so the depth is bounded."""
+    """Yield flat names and values; only one level is entered, so the depth is bounded."""
     if not isinstance(content, dict):
         raise DjetError(f'expected a mapping of parameters, but found {shown(content)}')
-    for name, value in content.items():
-        if name in SECTIONS and isinstance(value, dict):
+    for key, value in content.items():
+        name = str(key)
+        if isinstance(value, dict) and value and '.' not in name and not is_ros_own(name):
             yield from ((f'{name}.{inner}', inner_value) for inner, inner_value in value.items())
-        elif name not in SECTIONS or value is not None:
-            yield str(name), value
+        elif name not in SECTIONS or value not in (None, {}):
+            yield name, value
 
 
 def dump_yaml(config: Config, parts: Sequence[str] = ('', *SECTIONS), *,

@@ -116,7 +116,9 @@ class Camera:
         height, width = gray.shape
         if self.size is not None and self.size != (width, height):
             raise BadMessage('size_mismatch', f'image is {width}x{height} pixels, CameraInfo '
-                             f'(with its binning and ROI) is for {self.size[0]}x{self.size[1]}')
+                             f'(with its binning and ROI) is for {self.size[0]}x{self.size[1]}; '
+                             'take the CameraInfo of this image topic (remap camera_info, '
+                             '--info-topic), or calibrate at this size')
         if self.size is None:
             check_lens(self.raw_K, (width, height))
         if self._distortion is None:

@@ -31,6 +31,9 @@ _FEW_LEVELS, _LEAST_SHARE = 32, 1e-4
 # Features need a neighbourhood; OpenCV fails on slivers.
 _SMALLEST_SIDE = 16
 
+# Remedy for an image that contradicts itself.
+_PUBLISHER = ('correct height, width, step and encoding in the node that publishes it, or choose '
+              'another image topic')
 
 # Scans of a progressive JPEG: encoders write about ten.
 _MOST_SCANS = 64
@@ -175,10 +178,10 @@ def _raw(message: Any) -> tuple[_Pixels, NDArray[Any]]:
     data = _bytes(message.data)
     if step < row:
         raise BadMessage('short_step', f'image step is {step} bytes, a row of {width} pixels '
-                         f'{message.encoding} has {row}')
+                         f'{message.encoding} has {row}; {_PUBLISHER}')
     if len(data) < height * step:
         raise BadMessage('short_data', f'image data has {len(data)} bytes, {height} rows of '
-                         f'{step} have {height * step}')
+                         f'{step} have {height * step}; {_PUBLISHER}')
     values: NDArray[Any] = data[:height * step].reshape(height, step)[:, :row]
     if pixels.wide:
         values = values.view('>u2' if message.is_bigendian else '<u2')

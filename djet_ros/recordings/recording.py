@@ -238,22 +238,15 @@ class BagRecording(Recording):
         """Yield (input, topic) of the auxiliary inputs; strict: raise DjetError if one lacks."""
         for what, name in wanted.items():
             # The bag's ground truth is not a measurement, even if a file replaces it.
-            fitting = [topic.name for topic in self._fitting(AUXILIARY[what])
-                       if topic.name not in (self._ground_truth_topic(), self.image_topic)
-                       and (what not in _TOPIC_PATTERNS
-                            or _TOPIC_PATTERNS[what].search(topic.name))]
-            chosen = [topic for topic in fitting if name in (None, topic)]
+            have = [topic.name for topic in self._fitting(AUXILIARY[what])
+                    if topic.name not in (self._ground_truth_topic(), self.image_topic)]
+            pattern = _TOPIC_PATTERNS.get(what)
+            chosen = [topic for topic in have if topic == name or (
+                name is None and (pattern is None or pattern.search(topic)))]
             if len(chosen) == 1:
                 yield what, chosen[0]
-            elif strict and what == 'tf':
-                raise DjetError(f'{self.bag.path} has no topic /tf, which odometry.guess_frame '
-                                'requires; record it too')
-            elif strict and name is not None:
-                raise DjetError(f"{self.bag.path} has no topic '{name}' for '{what}'; choose with "
-                                f'--{what}-topic from: {", ".join(fitting) or "none"}')
             elif strict:
-                raise DjetError(f"{self.bag.path}: one topic of '{what}' is needed; choose one "
-                                f'with --{what}-topic from: {", ".join(fitting) or "none"}')
+                raise DjetError(f'{self.bag.path} has {_why_not_one(what, name, have)}')
         if wanted and any(topic.name == STATIC_FRAMES_TOPIC for topic in self._topics):
             yield 'frames', STATIC_FRAMES_TOPIC
 
@@ -335,6 +328,17 @@ def open_recording(path: Path, image_topic: str | None = None, info_topic: str |
         raise DjetError(f'{path} holds no IMU data; set odometry.imu to false, or name a '
                         'recording with an IMU')
     return SequenceRecording(sequence, 'imu' in auxiliary, poses, damaged)
+
+
+def _why_not_one(what: str, name: str | None, have: Collection[str]) -> str:
+    """Return what a bag has in place of one topic for an auxiliary input, and a remedy."""
+    if what == 'tf':
+        return 'no topic /tf, which odometry.guess_frame requires; record it too'
+    if not have:
+        return (f"no topic for '{what}' ({' or '.join(AUXILIARY[what])}); record one, or set the "
+                'parameters so that none is needed')
+    which = f"no single topic for '{what}'" if name is None else f"no topic '{name}' for '{what}'"
+    return f'{which}; choose one with --{what}-topic from: {", ".join(have)}'
 
 
 def _read_truth(path: Path, images: int) -> tuple[NDArray[np.int64] | None, Array]:

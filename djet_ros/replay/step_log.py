@@ -56,8 +56,8 @@ class StepLog:
                 if after.status is Status.TIME_JUMP]
 
     def advice(self) -> list[str]:
-        """Return warnings on gaps and on pairs that were not tracked."""
-        return [*self._of_gaps(), *self._of_pairs()]
+        """Return warnings on gaps, on pairs that were not tracked, and on mixed units."""
+        return [*self._of_gaps(), *self._of_pairs(), *self._of_units()]
 
     def _of_gaps(self) -> list[str]:
         """Return a warning if gaps between images exceed odometry.max_gap."""
@@ -86,6 +86,15 @@ class StepLog:
         advice = (_FEW_MATCHES_ADVICE if most is Status.TOO_FEW_MATCHES
                   else _NO_MOTION_ADVICE)
         return [f'none of {len(pairs)} pairs could be tracked (mostly {most.value}): {advice}']
+
+    def _of_units(self) -> list[str]:
+        """Return a warning if metric lengths follow relative ones, as when a source is late."""
+        steps = [step for step in self.steps if step.status is Status.OK and step.scale_known]
+        first = next((i for i, step in enumerate(steps) if step.metric), 0)
+        return [] if not first else [
+            f'the trajectory mixes units: its first {first} lengths are relative, those from '
+            f'stamp {seconds_text(steps[first].stamp_ns)} on are metric; start the source of '
+            'odometry.scale before the images, or use only the part after that stamp']
 
     def errors(self, truth: Array) -> PairErrors:
         """Return the errors of all pairs, of which there are some; truth: (N, 4, 4) true poses."""
