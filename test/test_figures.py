@@ -7,6 +7,7 @@ from pathlib import Path
 import subprocess
 import sys
 
+from conftest import write_small_kitti
 import cv2
 from djet_ros.cli.main import main
 from djet_ros.core.estimator import TwoViewEstimator
@@ -136,6 +137,7 @@ def test_two_images_and_a_camera_give_the_same_as_a_sequence(road, tmp_path, cap
     (['surfaces', 'flat', 'flat', '--camera', '9,9,9,9'],
      'have 0 matches, at least 20 are needed'),
     (['surfaces', 'road', '--pair', '2'], '--pair is 2'),
+    (['surfaces', 'single'], 'has one image; name a recording with two or more'),
     (['surfaces', 'road', '--match', '99999'], '--match is 99999; this pair has matches 0 to'),
     (['surfaces', 'road', '--output', 'a.jpg'], 'its name must end in .png or .gif'),
 ])
@@ -144,7 +146,8 @@ def test_an_invalid_call_is_one_line_and_exit_code_2(
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'text').write_text('no image')
     cv2.imwrite(str(tmp_path / 'flat.png'), np.zeros((200, 200), np.uint8))
-    places = {'road': road, 'image': road / 'image_0' / '000000.png', 'flat': 'flat.png'}
+    places = {'road': road, 'image': road / 'image_0' / '000000.png', 'flat': 'flat.png',
+              'single': write_small_kitti(tmp_path / 'dataset', frames=1)}
     code = lab([str(places.get(word, word)) for word in arguments])
     captured = capsys.readouterr()
     assert code == 2

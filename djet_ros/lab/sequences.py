@@ -88,6 +88,8 @@ def pair_of_frames(path: Path, index: int, workspace: Path
                    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Array]:
     """Return the images (H, W) of frames index and index + 1 of any dataset, and K (3, 3)."""
     sequence = readable_frames(path, workspace)
+    if len(sequence) < 2:
+        raise DjetError(f'{path} has one image; name a recording with two or more')
     if not 0 <= index < len(sequence) - 1:
         raise DjetError(f'--pair is {index}; {path} has pairs 0 to {len(sequence) - 2}')
     return sequence.image(index), sequence.image(index + 1), sequence.K
