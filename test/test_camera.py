@@ -1,5 +1,7 @@
 """CameraInfo of raw and of rectified images, and unusable ones."""
 
+import tracemalloc
+
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.odometry.camera import Camera, is_rectified, same_camera
@@ -327,3 +329,16 @@ def test_two_camera_infos_are_the_same_whatever_their_headers():
     assert same_camera(camera_info(K, SIZE, 1), camera_info(K, SIZE, 2))
     assert not same_camera(camera_info(K, SIZE), camera_info(K * [[1.1], [1], [1]], SIZE))
     assert not same_camera(camera_info(K, SIZE), camera_info(K, SIZE, binning_x=2))
+
+
+def test_undistortion_takes_memory_of_a_few_images_of_floats():
+    """Maps take 14 bytes per pixel, the fold another 24."""
+    width, height = 2000, 1500
+    camera = Camera(np.array([[1400.0, 0, 1000], [0, 1400, 750], [0, 0, 1]]),
+                    DISTORTIONS['plumb_bob'], (width, height))
+    gray = np.zeros((height, width), np.uint8)
+    tracemalloc.start()
+    camera.undistort(gray)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 40 * width * height

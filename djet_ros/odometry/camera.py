@@ -187,9 +187,10 @@ class Camera:
         There its Jacobian is singular. Tangential coefficients make that curve no exact circle;
         its smallest radius counts.
         """
-        x, y = np.meshgrid(np.arange(width), np.arange(height))
-        rays = np.linalg.inv(self.K) @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
-        away = np.hypot(rays[0], rays[1])
+        # Columns and rows are added: the rays of all pixels of large images take gigabytes.
+        x, y = np.arange(width), np.arange(height)[:, None]
+        away = np.hypot(*(by_x * x + (by_y * y + offset)
+                          for by_x, by_y, offset in np.linalg.inv(self.K)[:2]))
         step = away.max() / _ALONG
         radii = step * np.arange(1, _ALONG + 1)
         angles = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
@@ -200,7 +201,7 @@ class Camera:
             unfolded = np.linalg.det(slopes).reshape(_ALONG, _DIRECTIONS) > 0
         folded = np.flatnonzero(~unfolded.all(1))
         fold = folded[0] * step if len(folded) else np.inf
-        return np.asarray(away.reshape(height, width) > fold)
+        return np.asarray(away > fold)
 
     def _check_distortion(self, folded: NDArray[np.bool_]) -> None:
         """Raise BadMessage if hardly any of the undistorted image is in the raw image."""
