@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from djet_ros.core.fusion import agrees, fused, MeasuredRotation
 from djet_ros.core.geometry import rotation_exp, sphere_tangents
 from djet_ros.core.types import Array, RelativePose, Status
@@ -149,6 +151,34 @@ def test_a_saturated_gyro_measures_no_rotation() -> None:
     assert gyro.refused['end of its range'] > 50
     assert gyro.turn(400_000_000, 500_000_000) is None
     assert gyro.turn(0, PERIOD) is not None
+
+
+def test_the_smallest_range_of_a_mems_gyro_is_noticed() -> None:
+    gyro, range_ = mounted(), np.radians(125.0)
+    for i in range(200):
+        gyro.add(i * 5_000_000, np.array([0, 0, min(4 * np.sin(np.pi * i / 200), range_)]))
+    assert gyro.turn(400_000_000, 500_000_000) is None
+
+
+@pytest.mark.parametrize('wrong', [
+    {'scale': 1.02}, {'scale': 0.98}, {'about': np.radians([2.0, 0, 0])},
+    {'about': np.radians([0, -2.0, 0])}])
+def test_a_fast_rotation_agrees_with_a_gyro_of_common_scale_factor_and_mounting(
+        wrong: dict[str, Any]) -> None:
+    """By 2 % and by 2 degrees; images are as sure of a rotation as a hundredth of a pixel."""
+    rate = np.array([0.0, 0, 1.9])
+    R = rotation_exp(-rate * PERIOD * 1e-9)
+    off = rotation_exp(wrong.get('about', np.zeros(3)))
+    gyro = constant(wrong.get('scale', 1.0) * (off @ rate))
+    gyro.bias_covariance = np.eye(3) * 1e-4**2
+    turn = gyro.turn(SECOND // 2, SECOND // 2 + PERIOD)
+    assert turn is not None
+    visual = pair(R, np.array([0.0, 0, 1]), np.eye(5) * 1e-5**2)
+    assert agrees(turn, visual)
+    # What is fused is then nearly the rotation by the images.
+    assert np.linalg.norm(MeasuredRotation(fused(visual, turn).R, np.eye(3)).correction(R)) < 2e-5
+    # That of another robot does not agree.
+    assert not agrees(MeasuredRotation(R.T, turn.covariance), visual)
 
 
 def test_late_samples_neither_hide_nor_feign_saturation() -> None:

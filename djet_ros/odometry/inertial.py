@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from djet_ros.core.fusion import MeasuredRotation
+from djet_ros.core.geometry import rotation_log
 from djet_ros.core.types import Array
 from djet_ros.odometry.stamped import Stamped
 import numpy as np
@@ -27,12 +28,17 @@ _KEPT = 200_000
 # Longest gap between two samples over which rates are interpolated.
 _LONGEST_GAP_NS = 250_000_000
 
-# rad/s beyond every gyro's range, and from which on equal values in a row mean saturation.
-_FASTEST, _FAST = 200.0, 3.0
+# rad/s beyond every gyro's range, and from which on equal values in a row mean saturation: the
+# smallest range of MEMS gyros is 125 degrees per second.
+_FASTEST, _FAST = 200.0, 2.0
 _EQUAL_IN_A_ROW = 3
 
 # Standard deviation of the initial bias in rad/s: cheap gyros, warming up, rarely exceed 0.05.
 _BIAS_AT_FIRST = 0.05 / 3
+
+# Standard deviation of a rotation as a share of it, by the scale factor and the axes of the gyro:
+# data sheets of MEMS gyros allow up to 3 % for either, and mountings are known to a degree or so.
+_SCALE_FACTOR = 0.01
 
 # Standard deviation of an interpolated rate, as a share of the change between its samples.
 _INTERPOLATION = 1 / 6
@@ -144,10 +150,12 @@ class Gyro:
         if self.to_camera is None or (integral := self._integral(start_ns, end_ns)) is None:
             return None
         C, by_bias = self.to_camera, self.to_camera @ integral.by_bias
+        R = C @ integral.turn.T @ C.T
         measured = (self.noise.density**2 * integral.seconds + integral.interpolation
-                    + self.noise.walk**2 * integral.seconds**3 / 3)
+                    + self.noise.walk**2 * integral.seconds**3 / 3
+                    + _SCALE_FACTOR**2 * float(np.square(rotation_log(R)).sum()))
         covariance = measured * np.eye(3) + by_bias @ self._bias_at(end_ns) @ by_bias.T
-        return MeasuredRotation(C @ integral.turn.T @ C.T, covariance)
+        return MeasuredRotation(R, covariance)
 
     def learn(self, start_ns: int, end_ns: int, R: Array, covariance: Array) -> None:
         """
