@@ -765,6 +765,19 @@ def test_change_of_image_size_is_reported(tmp_path):
     assert summary(tmp_path / 'r')['status'] == {'FIRST_FRAME': 1, 'OK': 4, 'SIZE_CHANGED': 1}
 
 
+def test_autofocus_that_changes_every_camera_matrix_is_named_with_a_remedy(tmp_path):
+    messages = [
+        (topic, camera_info(K + np.diag([0.01 * i, 0.01 * i, 0]), SIZE, stamp), stamp)
+        if topic == INFO_TOPIC else (topic, message, stamp)
+        for i, (topic, message, stamp) in enumerate(drive())]
+    printed = djet('replay', record(tmp_path / 'bag', messages), '--output', tmp_path / 'r',
+                   expect=2).stderr
+    assert f'the camera matrix changes {FRAMES - 1} times' in printed
+    assert 'with autofocus and zoom off and one CameraInfo for all images' in printed
+    # A longer max_gap would not help.
+    assert printed.count('\n') == 1
+
+
 def test_images_before_the_first_camera_info_give_a_warning(tmp_path):
     def messages():
         for i, (topic, message, stamp) in enumerate(drive(info=False)):

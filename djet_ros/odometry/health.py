@@ -39,6 +39,9 @@ _REMEDIES_RECORDED = {
 REDUCE_LOAD = ('lower the rate (that of a bag player, too), the image size or '
                'estimator.max_features')
 
+# Remedy for a camera matrix that changes, as with autofocus.
+ONE_CAMERA_MATRIX = 'with autofocus and zoom off and one CameraInfo for all images'
+
 
 class Complaint(NamedTuple):
     """A problem: its short name, its level WARN or ERROR, and a text with the remedy."""
@@ -266,8 +269,8 @@ def _named_as_odom(config: OdometryConfig, image_frame: str) -> bool:
 def restart_reason(result: OdometryResult, before_ns: int | None, config: OdometryConfig) -> str:
     """Return a text on why the odometry restarted, an empty one if it did not."""
     if result.status is Status.SIZE_CHANGED:
-        return ('another image size or another camera; it continues at the last pose, and the '
-                'motion in between is unknown')
+        return ('another image size or camera matrix; it continues at the last pose, and the '
+                f'motion in between is unknown; publish one size, {ONE_CAMERA_MATRIX}')
     if result.status is not Status.TIME_JUMP or before_ns is None:
         return ''
     seconds = (result.stamp_ns - before_ns) * 1e-9

@@ -15,6 +15,7 @@ from djet_ros.config.sections import Config
 from djet_ros.core.types import Status
 from djet_ros.errors import DjetError, one_line
 from djet_ros.odometry.diagnostics import Counts
+from djet_ros.odometry.health import ONE_CAMERA_MATRIX
 from djet_ros.odometry.messages import (
     frame_of,
     mounted_frame,
@@ -222,8 +223,9 @@ class Replay:
         if first_problem:
             found.append(f'{_unusable(counts)} could not be used; {first_problem}')
         if changes := counts.status[Status.SIZE_CHANGED.value]:
-            found.append(f'the image size or the camera changes {_times(changes)}; the motion is '
-                         'unknown there, which leaves a gap in the trajectory')
+            found.append(f'the image size or the camera matrix changes {_times(changes)}; the '
+                         'motion is unknown there, which leaves a gap in the trajectory; record '
+                         f'one size, {ONE_CAMERA_MATRIX}')
         if back := [after for before, after in self._log.jumps() if after < before]:
             found.append(f'the stamps go back {_times(len(back))}; the poses restart at the '
                          f'origin at stamp {", ".join(map(seconds_text, back[:3]))}')

@@ -74,7 +74,7 @@ class StepLog:
         pairs = self.pairs()
         statuses = Counter(step.status for step in pairs)
         if not pairs:
-            return [] if len(self.steps) < 2 else [
+            return [] if not self.jumps() else [
                 f'none of {len(self.steps)} images could be paired with the one before: the time '
                 'between them exceeds odometry.max_gap; set it to a larger value']
         if statuses[Status.NO_PARALLAX] == len(pairs):
