@@ -168,6 +168,35 @@ def test_common_length_error_is_removed_from_single_lengths():
                           known_to(0.01).covariance)
 
 
+def test_independent_length_errors_are_not_inflated_for_correlation(keyframes):
+    """Three turning steps of 1 m: a noise of 2 % of each is 3 * (2 cm)^2 in all, and no more."""
+    taken = steps(np.array([np.linalg.matrix_power(pose(z=1.0, yaw=0.1), i) for i in range(4)]))
+    small = np.diag(SIGMAS**2 * 1e-4)
+    along = np.outer(np.eye(6)[2], np.eye(6)[2])
+
+    def graph_covariance(sigma, *, metric):
+        kept, _ = keyframes([replace(step, covariance=small + sigma**2 * along, metric=metric)
+                             for step in taken], keyframe_distance=2.5, keyframe_turn=90,
+                            length_noise=0.02)
+        edge, = kept.edges
+        return edge.inflated().covariance
+
+    def summed(first, each):
+        whole, motion = np.zeros((6, 6)), np.eye(4)
+        for _ in range(3):
+            whole = compose(motion, whole, taken[1].motion, first + each * along)
+            motion = motion @ taken[1].motion
+        return whole
+
+    # Of 5 %, the default of odometry.scale_uncertainty, the rest is common to all lengths.
+    chained = inflated_for_chain(small)
+    assert np.allclose(graph_covariance(0.05, metric=True), summed(chained, 0.02**2), rtol=1e-3)
+    assert np.allclose(graph_covariance(0.01, metric=True), summed(chained, 0.01**2), rtol=1e-2)
+    # Landmarks carry on the errors of relative lengths, which have none in common with a sensor.
+    assert np.allclose(graph_covariance(0.04, metric=False),
+                       inflated_for_chain(summed(small, 0.04**2)))
+
+
 def test_unknown_length_has_a_bounded_variance():
     """Its standard deviation is its length; the other directions keep theirs."""
     motion, direction = pose(z=2.0), np.diag([0, 0, 1.0, 0, 0, 0])

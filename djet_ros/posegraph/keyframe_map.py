@@ -44,7 +44,7 @@ class KeyframeOffset(Motion):
     The pose of a frame in its keyframe, with covariance.
 
     keyframe: number of the keyframe; known: whether the whole motion from there was estimated,
-    otherwise it is a guess.
+    otherwise it is a guess; uncorrelated: see ``Edge``.
     """
 
     keyframe: int
@@ -52,13 +52,29 @@ class KeyframeOffset(Motion):
     covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
     scale_known: bool = True
     known: bool = True
+    uncorrelated: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
-    def then(self, motion: Array, covariance: Array, scale_known: bool = False,
-             known: bool = True) -> KeyframeOffset:
-        """Return the offset of the next frame, from its motion (4, 4) with covariance (6, 6)."""
+    def then(self, step: Step, config: SlamConfig, uncertainty: float) -> KeyframeOffset:
+        """
+        Return the offset of the next frame, from the step to it.
+
+        uncertainty: relative standard deviation of metric lengths.
+        """
+        # Lengths in the unit of the track have no error in common, and landmarks carry theirs on.
+        noise = config.length_noise if step.metric else 0.0
+        covariance = step.independent_covariance(uncertainty if step.metric else 0.0, noise)
+        own = replace(step, covariance=covariance).length_noise(noise)
+        R = self.motion[:3, :3]
+        return KeyframeOffset(self.keyframe, self.motion @ step.motion,
+                              compose(self.motion, self.covariance, step.motion, covariance),
+                              self.scale_known and step.scale_known, self.known,
+                              self.uncorrelated + R @ own @ R.T)
+
+    def guessed(self, motion: Array, covariance: Array) -> KeyframeOffset:
+        """Return the offset of the next frame, from a guess (4, 4) with covariance (6, 6)."""
         return KeyframeOffset(self.keyframe, self.motion @ motion,
                               compose(self.motion, self.covariance, motion, covariance),
-                              self.scale_known and scale_known, self.known and known)
+                              scale_known=False, known=False)
 
     def is_far(self, config: SlamConfig) -> bool:
         """Return whether the frame is far enough away to be a keyframe itself."""
@@ -69,7 +85,8 @@ class KeyframeOffset(Motion):
     def edge(self, target: int) -> Edge:
         """Return the edge to the frame as keyframe number target."""
         return Edge(self.keyframe, target, self.motion, self.covariance,
-                    'odometry' if self.known else 'unknown', self.scale_known)
+                    'odometry' if self.known else 'unknown', self.scale_known,
+                    uncorrelated=self.uncorrelated)
 
 
 class _Pending(NamedTuple):
@@ -176,15 +193,14 @@ class KeyframeMap:
             return None
         reference = self._offsets.get(step.previous_stamp_ns)
         if step.tracked and reference is not None:
-            covariance = step.independent_covariance(self._uncertainty, self._slam.length_noise)
-            return reference.then(step.motion, covariance, step.scale_known)
+            return reference.then(step, self._slam, self._uncertainty)
         guess, covariance = unobserved_motion(self._newest_step, step)
         if not step.in_frame_of(self._newest_step):
             # The best guess is the last pose.
             self.correction = (self.correction @ self._newest_step.pose
                                @ np.linalg.inv(step.pose))
             guess = np.eye(4)
-        return self.newest.then(guess, covariance, known=False)
+        return self.newest.guessed(guess, covariance)
 
     def _add(self, step: Step, frame: Frame, offset: KeyframeOffset | None) -> KeyframeOffset:
         number = self.first + len(self.keyframes)

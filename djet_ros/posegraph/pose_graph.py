@@ -8,7 +8,7 @@ source.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
@@ -84,6 +84,19 @@ class Motion:
         return np.asarray(
             self.covariance - max(common, 0.0) * np.outer(translation, translation))
 
+    def length_noise(self, noise: float) -> Array:
+        """
+        Return the covariance (3, 3) of the translation by the error of its length alone.
+
+        noise: relative standard deviation of known lengths; a length may be known better.
+        """
+        squared = float(self.motion[:3, 3] @ self.motion[:3, 3])
+        if not self.scale_known or not squared:
+            return np.zeros((3, 3))
+        outer = np.outer(self.motion[:3, 3], self.motion[:3, 3])
+        known = float((outer * self.covariance[:3, :3]).sum()) / squared**2
+        return np.asarray(min(noise**2, known) * outer)
+
 
 @dataclass(frozen=True)
 class Edge(Motion):
@@ -93,7 +106,8 @@ class Edge(Motion):
     source, target: indices of vertices; kind: 'odometry' (of consecutive frames), 'link' (over
     more than one keyframe), 'loop' (of a revisited place) or 'unknown' (not estimated, with a
     large covariance); log_scale_ratio: of a loop, the logarithm of the unit of length at the
-    target over that at the source, and its standard deviation, or None.
+    target over that at the source, and its standard deviation, or None; uncorrelated: (3, 3) part
+    of the translation's covariance that is independent from pair to pair.
     """
 
     source: int
@@ -103,12 +117,14 @@ class Edge(Motion):
     kind: str = 'odometry'
     scale_known: bool = True
     log_scale_ratio: tuple[float, float] | None = None
+    uncorrelated: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
     def inflated(self) -> Edge:
         """Return the edge with the covariance inflated for correlated errors of the odometry."""
         if self.kind != 'odometry':
             return self
-        return replace(self, covariance=inflated_for_chain(self.covariance))
+        own = np.pad(self.uncorrelated, (0, 3))
+        return replace(self, covariance=inflated_for_chain(self.covariance - own) + own)
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,8 @@ def rescaled_edge(edge: Edge, factor: float) -> Edge:
         return edge
     scaling = np.diag([factor] * 3 + [1.0] * 3)
     return replace(edge, motion=rescaled_motion(edge.motion, factor),
-                   covariance=scaling @ edge.covariance @ scaling)
+                   covariance=scaling @ edge.covariance @ scaling,
+                   uncorrelated=factor**2 * edge.uncorrelated)
 
 
 def rescaled_motion(motion: Array, factor: float) -> Array:
