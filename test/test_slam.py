@@ -583,6 +583,18 @@ def test_outlier_loops_are_rejected(optimise):
     assert np.allclose(solution.graph.poses, clean.graph.poses, atol=0.05)
 
 
+@pytest.mark.parametrize(('square', 'rejected'), [(12.0, 0), (15.0, 0), (19.0, 1), (40.0, 1)])
+def test_loop_is_rejected_beyond_its_99_percent_bound(optimise, square, rejected):
+    """Of chi-squared with six degrees of freedom it is 16.8; the odometry is exact."""
+    true, _ = twice_round()
+    wrong = loop(true, 80, 20)
+    wrong.motion[:3, 3] += SIGMAS[:3] * np.sqrt(square / 3)
+    graph = chain(true, np.diag(SIGMAS**2) * 1e-6)
+    found = optimise(replace(graph, edges=(*graph.edges, wrong)))
+    assert found.rejected('loop') == rejected
+    assert len(found.accepted.edges) == len(graph.edges) + 1 - rejected
+
+
 def test_loop_of_unknown_length_constrains_directions(optimise):
     true, drifted = twice_round()
     graph = chain(drifted)

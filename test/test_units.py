@@ -104,7 +104,8 @@ def test_rejected_edges_are_counted_by_kind():
     edges = tuple(Edge(0, 1, np.eye(4), np.eye(6), kind)
                   for kind in ('odometry', 'link', 'loop', 'loop', 'loop'))
     found = OptimisedGraph(PoseGraph(np.arange(2), circles()[:2], edges),
-                           np.array([1.0, 0.4, 0.4, 0.0, 0.6]), np.ones(2))
+                           np.array([1.0, 0.2, 0.2, 0.0, 0.3]), np.ones(2))
+    assert found.accepted.edges == (edges[0], edges[4])
     assert [found.rejected(kind) for kind in ('odometry', 'link', 'loop')] == [0, 1, 2]
 
 

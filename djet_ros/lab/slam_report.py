@@ -36,15 +36,15 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
     """
     Write trajectories, graph, plot and summary into a folder, and return the summary.
 
-    truth: (N, 4, 4) of the frames, NaN where unknown; name: of the recording. The optimised graph
-    holds all edges, including those that the robust kernel rejected.
+    truth: (N, 4, 4) of the frames, NaN where unknown; name: of the recording. The files of the
+    graph leave out rejected edges, as another backend would not know that they are wrong.
     """
     frames, graph = slam.frames, slam.optimised.graph
     trajectories = {'before': slam.odometry_poses(), 'after': slam.optimised_poses()}
     for label, poses in trajectories.items():
         StampedTrajectory(frames.stamps_ns, poses).write_tum(folder / f'{label}_tum.txt')
     for kind in ('g2o', 'csv'):
-        write_graph(graph, folder / f'pose_graph.{kind}', kind)
+        write_graph(slam.optimised.accepted, folder / f'pose_graph.{kind}', kind)
     values = flat(config)
     parameters = {full.removeprefix('slam.'): values[full].value for full in PARAMETERS}
     kinds = Counter(edge.kind for edge in graph.edges)
@@ -115,6 +115,5 @@ def _plot(path: Path, slam: Slam, truth: Array | None, title: str) -> None:
 def _closed(slam: Slam, positions: Array) -> Array:
     """Return the positions (L, 3), among those of all frames (N, 3), of accepted loop edges."""
     _, first = np.unique([offset.keyframe for offset in slam.offsets], return_index=True)
-    closing = [edge.source for edge, trust in zip(slam.optimised.graph.edges, slam.optimised.trust)
-               if edge.kind == 'loop' and trust >= 0.5]
+    closing = [edge.source for edge in slam.optimised.accepted.edges if edge.kind == 'loop']
     return np.asarray(positions[first[np.array(closing, np.int64)]])

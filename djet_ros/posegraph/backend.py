@@ -20,6 +20,9 @@ _PRIOR_SIGMA = 1e-6
 # Kinds of edges without a robust kernel.
 _KNOWN_INLIERS = ('odometry', 'unknown')
 
+# Weight in the kernel of an edge at the 99 % bound of chi-squared, which is the kernel's scale.
+_REJECTED = 0.25
+
 
 @dataclass(frozen=True)
 class OptimisedGraph:
@@ -34,10 +37,16 @@ class OptimisedGraph:
     trust: Array
     factors: Array
 
+    @property
+    def accepted(self) -> PoseGraph:
+        """Return the graph without the edges that contradict it, beyond their 99 % bound."""
+        return replace(self.graph, edges=tuple(
+            edge for edge, trust in zip(self.graph.edges, self.trust) if trust >= _REJECTED))
+
     def rejected(self, kind: str) -> int:
-        """Return the number of edges of a kind with a weight below 0.5."""
-        return sum(bool(edge.kind == kind and trust < 0.5)
-                   for edge, trust in zip(self.graph.edges, self.trust))
+        """Return the number of edges of a kind that are not in the accepted graph."""
+        return sum(edge.kind == kind for edge in self.graph.edges) - sum(
+            edge.kind == kind for edge in self.accepted.edges)
 
 
 def optimise(graph: PoseGraph, first: float = 1.0) -> OptimisedGraph:
