@@ -35,6 +35,11 @@ class Live:
         self._cards, self._odometry, self._was = Cards(), Odometry(
             'body', base_frame, MOUNTING if base_frame else None), None
 
+    def restart(self, stamp):
+        """Have the odometry start again, at a stamp."""
+        self._odometry.stamp, self._was = stamp, None
+        self._odometry.reset()
+
     def drive(self, positions):
         self.session.camera_info(camera_info(K, SIZE))
         for metres in positions:
@@ -137,6 +142,16 @@ def test_reset_starts_a_new_map(live):
     one.drive(WAYS[5:])
     until(lambda: len(one.graph.published('/tf')) == len(WAYS))
     assert one.slam.map.keyframes[0].stamp_ns == START + 5 * 100_000_000
+
+
+def test_discarding_the_map_at_a_step_back_in_time_is_logged(live):
+    one = live()
+    one.drive(WAYS[:5])
+    one.restart(START - 10**9)
+    one.drive(WAYS[:2])
+    until(lambda: len(one.graph.published('/tf')) == 7)
+    assert one.graph.lines == ['warning: the odometry went back in time by 1.400 s: map of 3 '
+                               'keyframes discarded; a new map starts']
 
 
 def test_nothing_is_published_after_a_stop(live):

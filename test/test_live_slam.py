@@ -468,6 +468,7 @@ def test_step_back_in_time_starts_a_new_map(live):
 
 
 def in_memory(kind):
+    gc.collect()
     return sum(type(one) is kind for one in gc.get_objects())
 
 

@@ -158,6 +158,9 @@ class GraphSession:
             self._slam.node_values = self._node_values()
             self._publish(task.do())
             self._latencies.add(task.since)
+            if self._slam.remark:
+                self._wiring.log('warning', self._slam.remark)
+                self._slam.remark = ''
             if self._slam.problem is not None:
                 self._log.warn(type(self._slam.problem).__name__, str(self._slam.problem))
 

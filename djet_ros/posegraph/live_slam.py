@@ -54,6 +54,8 @@ class LiveSlam:
         self.config, self.slam = config, config.slam
         # Values that the live node adds to each diagnostics message.
         self.node_values: dict[str, str] = {}
+        # Why the newest message discarded the map, for the log.
+        self.remark = ''
         self._messages = MessageFactory(message_type)
         self._node = node
         self._rectified = is_rectified(config.odometry.rectified, image_topic)
@@ -155,11 +157,14 @@ class LiveSlam:
 
     def odometry(self, message: Any) -> list[Outgoing]:
         """Take an Odometry; a step back in time starts a new map."""
-        if self._steps.goes_back(message):
+        stamp, steps = stamp_ns(message.header), self._steps
+        if stamp < steps.newest_ns:
+            self.remark = (f'the odometry went back in time by '
+                           f'{(steps.newest_ns - stamp) * 1e-9:.3f} s: map of '
+                           f'{len(self.map.keyframes)} keyframes discarded; a new map starts')
             # Its image, and perhaps its other messages, have arrived already: keep them.
-            steps = self._steps
             self._begin()
-            steps.go_back(stamp_ns(message.header))
+            steps.go_back(stamp)
             self._steps = steps
         try:
             return self._take(self._steps.odometry(message))

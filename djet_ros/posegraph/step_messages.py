@@ -49,7 +49,7 @@ class StepMessages:
 
     convention: axes in messages, 'optical' or 'body'; base_frame: frame of the vehicle if the
     odometry is of it, with the pose (4, 4) of the camera's optical frame in it, mounting; missing:
-    number of frames whose messages were incomplete.
+    number of frames whose messages were incomplete; newest_ns: stamp of the last Odometry, or -1.
     """
 
     def __init__(self, convention: str, base_frame: str = '', mounting: Array | None = None
@@ -63,15 +63,11 @@ class StepMessages:
         self._parts: dict[int, _Parts] = {}
         # Frames of failed pairs, newest last; one may be the reference of the next motion.
         self._bad: deque[Step] = deque(maxlen=_MAX_WAITING)
-        self._newest = -1
-
-    def goes_back(self, odometry: Any) -> bool:
-        """Return whether an Odometry is earlier than the last one."""
-        return stamp_ns(odometry.header) < self._newest
+        self.newest_ns = -1
 
     def go_back(self, stamp: int) -> None:
         """Restart at a stamp; keep messages that are waiting for it."""
-        self.missing, self._newest = 0, -1
+        self.missing, self.newest_ns = 0, -1
         self._bad.clear()
         self._parts = {at: parts for at, parts in self._parts.items()
                        if at == stamp and parts.odometry is None}
@@ -88,9 +84,9 @@ class StepMessages:
     def odometry(self, message: Any) -> list[Step]:
         """Take an Odometry that does not go back in time; return the steps that it completes."""
         stamp, pose = pose_of(message)
-        if stamp == self._newest:
+        if stamp == self.newest_ns:
             return []
-        self._newest = stamp
+        self.newest_ns = stamp
         if not np.isfinite(pose).all():
             raise DjetError(f'the pose of the odometry with stamp {stamp} ns is not finite; check '
                             'the publisher of the odometry')
