@@ -415,6 +415,29 @@ def test_map_with_body_axes_is_the_same_in_other_axes(live, driven):
     assert np.allclose(correction @ drive.by_odometry[stamp], newest)
 
 
+@pytest.mark.parametrize(('convention', 'other', 'frame'), [
+    ('optical', 'body', 'camera_body'), ('body', 'optical', 'camera')])
+def test_odometry_of_another_convention_is_refused(live, convention, other, frame):
+    """Its axes would be taken for others, and no loop would fit."""
+    drive = Drive(live, with_values(FEW_FEATURES, {'odometry.frame_convention': convention}))
+    drive.odometry = Odometry(other)
+    drive.to_and_fro(2)
+    assert str(drive.slam.problem) == (
+        f"the relative pose is in '{frame}', which has the axes of odometry.frame_convention "
+        f'{other}, while it is {convention} here; give both nodes the same')
+    assert drive.slam.map.count('odometry') == 0
+    # A name of its own says nothing about the axes.
+    assert not drive.slam._check_convention('front')
+
+
+def test_map_frame_of_the_name_of_the_odometry_s_frame_is_an_error(live):
+    drive = Drive(live, slam=replace(QUICK, map_frame='odom'))
+    drive.start()
+    drive.go(pose(x=1.0))
+    assert drive.slam.state == ('ERROR', 'slam.map_frame is odom_frame')
+    assert not drive.corrections
+
+
 def test_map_is_of_the_base_frame_once_tf_has_the_mounting(live, driven):
     drive = Drive(live, from_flat({'estimator.max_features': 800,
                                    'odometry.base_frame': 'base_link'}))

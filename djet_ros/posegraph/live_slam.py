@@ -7,6 +7,7 @@ Its motions come from the odometry, its loops from the images of keyframes.
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
+from dataclasses import replace
 from typing import Any
 
 from djet_ros.config.sections import Config
@@ -17,6 +18,7 @@ from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.images import BadMessage, gray_image
 from djet_ros.odometry.masks import Masks
 from djet_ros.odometry.messages import (
+    camera_frame,
     frame_of,
     MessageFactory,
     MessageType,
@@ -68,6 +70,8 @@ class LiveSlam:
         self._camera: Camera | None = None
         # Images with their cameras by stamp; None before the first CameraInfo.
         self._images: OrderedDict[int, tuple[Any, Camera | None]] = OrderedDict()
+        # frame_id of the newest image.
+        self._image_frame = ''
         self._masks = Masks(static_mask)
         self.reset()
 
@@ -129,7 +133,7 @@ class LiveSlam:
 
     def image(self, message: Any) -> None:
         """Take an Image or CompressedImage; it waits for the odometry of its stamp."""
-        stamp = stamp_ns(message.header)
+        stamp, self._image_frame = stamp_ns(message.header), frame_of(message.header)
         self._images[stamp] = message, self._camera
         self._images.move_to_end(stamp)
         if len(self._images) > self.slam.image_buffer:
@@ -142,6 +146,7 @@ class LiveSlam:
     def relative_pose(self, message: Any) -> list[Outgoing]:
         """Take a PoseWithCovarianceStamped of the current camera in the previous one."""
         try:
+            self._check_convention(message.header.frame_id)
             return self._take(self._steps.relative_pose(message))
         except DjetError as problem:
             self._reject('relative_pose_cov', problem)
@@ -204,6 +209,8 @@ class LiveSlam:
             return 'WARN', 'waiting for the mounting of the camera on tf'
         if self._last is None:
             return 'WARN', 'waiting for odometry'
+        if self._last.odom_frame == self.slam.map_frame:
+            return 'ERROR', 'slam.map_frame is odom_frame'
         if not self.map.keyframes:
             return 'WARN', ('waiting for camera_info' if self._info is None
                             else 'waiting for the images of the odometry')
@@ -238,7 +245,9 @@ class LiveSlam:
             self.problem = None
             self.map.extend(step, self._frame)
             self._last = step
-            if self.slam.publish_tf and self.map.keyframes:
+            # tf refuses a frame that is its own parent.
+            if self.slam.publish_tf and self.map.keyframes \
+                    and step.odom_frame != self.slam.map_frame:
                 outgoing.append(Outgoing('/tf', self._messages.frame(
                     step.stamp_ns, self.slam.map_frame, step.odom_frame,
                     self._turned(self.map.correction))))
@@ -274,6 +283,18 @@ class LiveSlam:
 
     def _turned(self, pose: Array) -> Array:
         return np.asarray(self._mounting @ pose @ np.linalg.inv(self._mounting))
+
+    def _check_convention(self, frame: str) -> None:
+        """Raise DjetError if a frame of the odometry is named by the other frame_convention."""
+        own = self.config.odometry
+        other = replace(own, camera_frame='', frame_convention=(
+            'optical' if own.frame_convention == 'body' else 'body'))
+        if frame != camera_frame(own, self._image_frame) \
+                and frame == camera_frame(other, self._image_frame):
+            raise DjetError(
+                f"the relative pose is in '{frame}', which has the axes of "
+                f'odometry.frame_convention {other.frame_convention}, while it is '
+                f'{own.frame_convention} here; give both nodes the same')
 
     def _reject(self, topic: str, problem: DjetError) -> None:
         self.rejected[topic] += 1
