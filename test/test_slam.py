@@ -628,7 +628,7 @@ def test_alignment_undoes_any_motion_and_scale():
     R = rotation_exp(rng.normal(size=3))
     moved = truth @ R.T + [1, 2, 3]
     assert np.allclose(aligned(moved, truth), truth)
-    assert np.allclose(aligned(0.2 * moved, truth, scaled=False), truth)
+    assert np.allclose(aligned(0.2 * moved, truth, metric=False), truth)
     assert position_rmse(aligned(0.2 * moved, truth), truth) > 0.5
     holes = truth.copy()
     holes[3:6] = np.nan

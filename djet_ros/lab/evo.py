@@ -28,13 +28,13 @@ class TrajectoryMetrics:
     rpe_deg: float
 
 
-def trajectory_metrics(truth: Path, estimate: Path, scaled: bool = True) -> TrajectoryMetrics:
+def trajectory_metrics(truth: Path, estimate: Path, metric: bool = True) -> TrajectoryMetrics:
     """
     Compare two TUM files; raise DjetError if evo is missing or fails.
 
-    scaled: whether the estimate's scale is known; otherwise it is aligned as well.
+    metric: whether the estimate's scale is known; otherwise it is aligned as well.
     """
-    scale = () if scaled else ('--align', '--correct_scale')
+    scale = () if metric else ('--align', '--correct_scale')
     return TrajectoryMetrics(
         _rmse('evo_ape', truth, estimate, *(scale or ['--align'])),
         _rmse('evo_rpe', truth, estimate, '--pose_relation', 'trans_part', *scale),

@@ -73,14 +73,14 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
     return summary
 
 
-def _error(poses: Array, truth: Array, scaled: bool) -> dict[str, float]:
+def _error(poses: Array, truth: Array, metric: bool) -> dict[str, float]:
     positions = truth[:, :3, 3]
-    return {'ape_m': position_rmse(aligned(poses[:, :3, 3], positions, scaled), positions)}
+    return {'ape_m': position_rmse(aligned(poses[:, :3, 3], positions, metric), positions)}
 
 
-def _evo(folder: Path, label: str, scaled: bool) -> dict[str, float]:
+def _evo(folder: Path, label: str, metric: bool) -> dict[str, float]:
     """Return the metrics of a trajectory file by evo."""
-    metrics = trajectory_metrics(folder / 'truth_tum.txt', folder / f'{label}_tum.txt', scaled)
+    metrics = trajectory_metrics(folder / 'truth_tum.txt', folder / f'{label}_tum.txt', metric)
     return {f'evo_{name}': value for name, value in asdict(metrics).items()}
 
 

@@ -6,11 +6,11 @@ from djet_ros.core.types import Array
 import numpy as np
 
 
-def aligned(estimate: Array, truth: Array, scaled: bool = True) -> Array:
+def aligned(estimate: Array, truth: Array, metric: bool = True) -> Array:
     """
     Align positions (N, 3) with the true ones (N, 3) by least squares (Umeyama, PAMI 1991).
 
-    scaled: whether the estimate has true lengths; otherwise its scale is estimated as well. Rows
+    metric: whether the estimate has true lengths; otherwise its scale is estimated as well. Rows
     that are NaN in the truth are only transformed.
     """
     known = np.isfinite(truth).all(axis=1)
@@ -19,7 +19,7 @@ def aligned(estimate: Array, truth: Array, scaled: bool = True) -> Array:
     U, D, Vt = np.linalg.svd(centred_truth.T @ centred)
     S = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
     spread = float((centred**2).sum())
-    scale = 1.0 if scaled or not spread else float((D * S).sum()) / spread
+    scale = 1.0 if metric or not spread else float((D * S).sum()) / spread
     return np.asarray(scale * (estimate - centre) @ ((U * S) @ Vt).T + goal)
 
 
