@@ -7,12 +7,14 @@ from dataclasses import replace
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.rivals import unsigned_distance
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.starts import KnownMotion
 from djet_ros.core.three_views import consistent_motion
 from djet_ros.core.types import (
     Array,
     of_same_camera,
+    Pose,
     RelativePose,
     Status,
     TRACKED,
@@ -184,7 +186,12 @@ class VisualOdometry:
             return pair
         if np.array_equal(motion.R, pair.R) and np.array_equal(motion.t, pair.t):
             return as_decided(pair)
-        return self._estimator.estimate_near(reference.view, view, pair, motion, priors)
+        again = self._estimator.estimate_near(reference.view, view, pair, motion, priors)
+        # It may converge to the minimum that was found before.
+        refined = Pose(again.R, again.t)
+        closer = (unsigned_distance(refined, motion)
+                  < unsigned_distance(refined, Pose(pair.R, pair.t)))
+        return again if closer else pair
 
     def _verified(self, view: View, pair: RelativePose, priors: KnownMotion,
                   span: Span) -> RelativePose:
