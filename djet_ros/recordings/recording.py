@@ -335,8 +335,9 @@ def _why_not_one(what: str, name: str | None, have: Collection[str]) -> str:
     if what == 'tf':
         return 'no topic /tf, which odometry.guess_frame requires; record it too'
     if not have:
-        return (f"no topic for '{what}' ({' or '.join(AUXILIARY[what])}); record one, or set the "
-                'parameters so that none is needed')
+        named = '' if name is None else f"'{name}' "
+        return (f"no topic {named}for '{what}' ({' or '.join(AUXILIARY[what])}); record one, or "
+                'set the parameters so that none is needed')
     which = f"no single topic for '{what}'" if name is None else f"no topic '{name}' for '{what}'"
     return f'{which}; choose one with --{what}-topic from: {", ".join(have)}'
 
