@@ -150,34 +150,31 @@ def is_planar(x: Array, y: Array, noise: float) -> bool:
     return H is not None and _fits_homography(np.asarray(H, np.float64), x, y, noise)
 
 
-def _fits_homography(H: Array, x: Array, y: Array, noise: float,
-                     excess: float = _MAX_EXCESS) -> bool:
+def _fits_homography(H: Array, x: Array, y: Array, noise: float) -> bool:
     """Return whether a homography (3, 3) brings x to y, both (N, 2), to within their noise."""
     if not np.isfinite(H).all():
         return False
     errors = np.linalg.norm(cv2.perspectiveTransform(x[:, None], H)[:, 0] - y, axis=1)
     # For normal errors in both directions the median distance is 1.18 standard deviations.
-    return bool(np.median(errors) < excess * 1.18 * noise
+    return bool(np.median(errors) < _MAX_EXCESS * 1.18 * noise
                 and (errors > _OUTLIER * noise).mean() < _MAX_OFF_PLANE)
 
 
-def planar_twin(pose: Pose, K: Array, x: Array, y: Array, noise: float,
-                excess: float = _MAX_EXCESS) -> Rival | None:
+def planar_twin(pose: Pose, K: Array, x: Array, y: Array, noise: float) -> Rival | None:
     """
     Return the second motion that explains matches x, y (N, 2) of one plane.
 
     With n the normal of the plane over its distance, H = R + t n' is also the homography of a
     second motion, whose t is about along n (Longuet-Higgins, Proc. R. Soc. B 1986). Only chirality
-    decides between the two, which gives the preference. noise: as for ``is_planar``; excess: the
-    factor by which the errors of a plane may exceed it. None if the scene is not planar, or both
-    motions are the same.
+    decides between the two, which gives the preference. noise: as for ``is_planar``; None if the
+    scene is not planar, or both motions are the same.
     """
     few, subset = (subsampled(len(x), count) for count in (_SCREENED_ON, _REFINED_ON))
     # A few matches suffice to reject a plane in most scenes.
-    if _induced_homography(pose, K, x[few], y[few], noise, excess) is None:
+    if _induced_homography(pose, K, x[few], y[few], noise) is None:
         return None
     x, y = x[subset], y[subset]
-    H = _induced_homography(pose, K, x, y, noise, excess)
+    H = _induced_homography(pose, K, x, y, noise)
     if H is None:
         return None
     rays_x = rays(K, x)
@@ -193,8 +190,7 @@ def planar_twin(pose: Pose, K: Array, x: Array, y: Array, noise: float,
     return Rival(candidates[farthest], float(preferences(losses, x, 0)[1]))
 
 
-def _induced_homography(pose: Pose, K: Array, x: Array, y: Array, noise: float, excess: float
-                        ) -> Array | None:
+def _induced_homography(pose: Pose, K: Array, x: Array, y: Array, noise: float) -> Array | None:
     """Return H = R + t n' (3, 3), with n fitted to the inverse depths; None if it does not fit."""
     rays_x = rays(K, x)
     inverse, sigma = inverse_depths(pose.R, pose.t, rays_x, rays(K, y))
@@ -202,7 +198,7 @@ def _induced_homography(pose: Pose, K: Array, x: Array, y: Array, noise: float, 
         return None
     n = np.linalg.lstsq(rays_x / sigma[:, None], inverse / sigma, rcond=None)[0]
     H = np.asarray(pose.R + np.outer(pose.t, n))
-    return H if _fits_homography(K @ H @ np.linalg.inv(K), x, y, noise, excess) else None
+    return H if _fits_homography(K @ H @ np.linalg.inv(K), x, y, noise) else None
 
 
 def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,

@@ -22,26 +22,20 @@ from djet_ros.core.rivals import (
     motion_without_attached,
     planar_twin,
     preferences,
-    refined_rivals,
     Rival,
     second_motion,
     SecondMotion,
     SIGNIFICANT_PREFERENCE,
     unsigned_distance,
 )
-from djet_ros.core.sketch import losses_at
 from djet_ros.core.surfaces import ResidualSurface
-from djet_ros.core.types import Array, Pose
+from djet_ros.core.types import Pose
 import numpy as np
 from numpy.typing import NDArray
 
 # chosen: area of a body's matches, relative to those of the other motion, below which it is not
 # mistaken for the static world.
 _SMALL_BODY = 0.3
-
-# chosen: factor by which errors may exceed the noise where a plane may be all there is. With blur
-# and haze it was up to 1.6 on rendered planes.
-_LOOSE_EXCESS = 2.0
 
 # chosen: ratio of near to far depth above which points may be of one body: it is about as deep as
 # it is wide, and no nearer than its depth.
@@ -169,11 +163,8 @@ def _with_planar_twin(track: Track, pair: Pair) -> Track:
     may end at the same one.
     """
     agree = track.inliers()
-    if not agree.any():
-        return track
-    matches = pair.x[agree], track.placed.places[agree]
-    twin = (planar_twin(track.pose, pair.current.K, *matches, track.scale)
-            or _loose_twin(track, pair, *matches))
+    twin = planar_twin(track.pose, pair.current.K, pair.x[agree],
+                       track.placed.places[agree], track.scale) if agree.any() else None
     if twin is None:
         return track
     near = unsigned_distance(track.pose, twin.pose) / 2
@@ -181,22 +172,6 @@ def _with_planar_twin(track: Track, pair: Pair) -> Track:
            for rival in (*track.rivals, *track.nearby)):
         return track
     return replace(track, nearby=(*track.nearby, twin))
-
-
-def _loose_twin(track: Track, pair: Pair, x: Array, y: Array) -> Rival | None:
-    """
-    Return the second motion of a scene that is nearly one plane; None if it is not.
-
-    x, y: (N, 2) the inliers. What is off the plane may exclude it: its preference is also by the
-    losses.
-    """
-    twin = planar_twin(track.pose, pair.current.K, x, y, track.scale, _LOOSE_EXCESS)
-    if twin is None:
-        return None
-    refined, = refined_rivals(track.problem, [twin.pose], track.loss)
-    losses = losses_at(track.problem, [track.pose, refined], track.loss)
-    preferred = preferences(losses, pair.x[track.voting], 0)[1]
-    return Rival(refined, max(twin.preference, float(preferred)))
 
 
 def _camera_of_two_motions(algorithm: Algorithm, track: Track, noise: float) -> Track:
