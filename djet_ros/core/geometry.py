@@ -220,6 +220,15 @@ def inverse_depths(R: Array, t: Array, rays_x: Array, rays_y: Array) -> tuple[Ar
     return rho, np.abs(m3 + rho * t3) * pulled / squared
 
 
+def depths_in_second(R: Array, t: Array, rays_x: Array, rho: Array) -> Array:
+    """
+    Return the depths (N,) in B of points on rays (N, 3) of A, over their depths in A.
+
+    rho: (N,) inverse depths in A, in units of 1 / |t|.
+    """
+    return np.asarray((rays_x @ R.T)[:, 2] + rho * t[2])
+
+
 def patch_warp(K: Array, R: Array, y: Array, depth_ratio: Array) -> Array:
     """
     Return the local homographies (N, 3, 2) of patches that are fronto-parallel in A, as seen in B.

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from djet_ros.core.bundle import Landmarks, points_in_frame, Poses, projected
-from djet_ros.core.geometry import inverse_depths
+from djet_ros.core.geometry import depths_in_second, inverse_depths
 from djet_ros.core.paraboloid import median, weighted_median
 from djet_ros.core.radial import undistorted_rays
 from djet_ros.core.types import Array, Pose, RelativePose
@@ -72,7 +72,7 @@ class KnownDepths:
         y = pair.y_opt[pair.inliers]
         rays_x = undistorted_rays(K, pair.x[pair.inliers], k1)
         rho, _ = inverse_depths(pair.R, pair.t, rays_x, undistorted_rays(K, y, k1))
-        depths = (rays_x @ pair.R.T + rho[:, None] * pair.t)[:, 2]
+        depths = depths_in_second(pair.R, pair.t, rays_x, rho)
         ahead = (rho > 0) & (depths > 0)
         return cls(y[ahead], rho[ahead] / (depths[ahead] * length), K, k1)
 
@@ -114,10 +114,20 @@ class KnownDepths:
 
     def _matched(self, x: Array) -> tuple[Array, NDArray[np.int64]]:
         """Match pixels x (N, 2) with the nearest points: inverse depths and indices into x."""
-        if not len(self.pixels) or not len(x):
-            return np.empty(0), np.empty(0, np.int64)
-        # Built in half the time of a balanced one, and as fast to query.
-        tree = cKDTree(x, balanced_tree=False, compact_nodes=False)
-        distances, match = tree.query(self.pixels, distance_upper_bound=_MATCH_RADIUS)
-        near = np.isfinite(distances)
-        return self.rho[near], match[near]
+        near, match = same_points(self.pixels, x)
+        return self.rho[near], match
+
+
+def same_points(pixels: Array, x: Array) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """
+    Match pixels (P, 2) of one pair or of landmarks with those of another pair, x (N, 2).
+
+    Returns the mask (P,) of those that have one of the same point, and its index (M,) in x.
+    """
+    if not len(pixels) or not len(x):
+        return np.zeros(len(pixels), bool), np.empty(0, np.int64)
+    # Built in half the time of a balanced one, and as fast to query.
+    tree = cKDTree(x, balanced_tree=False, compact_nodes=False)
+    distances, match = tree.query(pixels, distance_upper_bound=_MATCH_RADIUS)
+    near = np.isfinite(distances)
+    return near, match[near]

@@ -10,18 +10,14 @@ from __future__ import annotations
 
 from itertools import product
 
-from djet_ros.core.geometry import inverse_depths, rays
+from djet_ros.core.geometry import depths_in_second, inverse_depths, rays
 from djet_ros.core.jet import Loss, robust_scale
+from djet_ros.core.known_depths import same_points
 from djet_ros.core.paraboloid import weighted_median
 from djet_ros.core.rivals import preferences, SIGNIFICANT_PREFERENCE
 from djet_ros.core.types import Array, Pose, RelativePose
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
-
-# Pixels; chosen: distance of a match of one pair from one of the other up to which they are of the
-# same point.
-_SAME_POINT = 1.5
 
 # chosen: fewer shared points do not decide.
 _MIN_POINTS = 30
@@ -47,10 +43,8 @@ def consistent_motion(before: RelativePose, current: RelativePose, K: Array) -> 
     if not before.t.any() or not current.t.any():
         return None
     x, y = (places[current.inliers] for places in (current.x, current.y))
-    tree = cKDTree(x, balanced_tree=False, compact_nodes=False)
-    distances, match = tree.query(before.y[before.inliers], distance_upper_bound=_SAME_POINT)
-    shared = np.isfinite(distances)
-    x, y = x[match[shared]], y[match[shared]]
+    shared, match = same_points(before.y[before.inliers], x)
+    x, y = x[match], y[match]
     if len(x) < _MIN_POINTS:
         return None
     motions = [Pose(current.R, current.t), *current.rivals]
@@ -63,13 +57,13 @@ def consistent_motion(before: RelativePose, current: RelativePose, K: Array) -> 
     losses, _ = Loss('geman_mcclure', _OUTLIER * noise)(errors**2)
     best = int(losses.sum(1).argmin())
     allowed = _MAX_NOISE * robust_scale(current.residuals[current.inliers])
-    if robust_scale(errors[best]) > allowed:
+    # NaN, as of a point in the plane of the camera, decides nothing.
+    if not robust_scale(errors[best]) <= allowed:
         return None
     chosen = best % len(motions)
     others = np.arange(len(errors)) % len(motions) != chosen
-    if (preferences(losses, x, best)[others] < SIGNIFICANT_PREFERENCE).any():
-        return None
-    return motions[chosen]
+    decided = (preferences(losses, x, best)[others] >= SIGNIFICANT_PREFERENCE).all()
+    return motions[chosen] if decided else None
 
 
 def _depths_after(pair: RelativePose, motion: Pose, K: Array, shared: NDArray[np.bool_]
@@ -83,7 +77,7 @@ def _depths_after(pair: RelativePose, motion: Pose, K: Array, shared: NDArray[np
     """
     rays_x, rays_y = (rays(K, places[pair.inliers][shared]) for places in (pair.x, pair.y))
     rho, sigma = inverse_depths(motion.R, motion.t, rays_x, rays_y)
-    depths = (rays_x @ motion.R.T)[:, 2] + rho * motion.t[2]
+    depths = depths_in_second(motion.R, motion.t, rays_x, rho)
     return np.sign(np.median(rho)) * rho / depths, sigma / np.abs(depths)
 
 

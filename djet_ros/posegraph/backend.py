@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 from djet_ros.core.types import Array
 from djet_ros.posegraph.pose_graph import PoseGraph
 from djet_ros.posegraph.units import to_common_unit
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 # GTSAM's tangent vectors have the rotation before the translation.
 _ORDER = [3, 4, 5, 0, 1, 2]
@@ -40,13 +42,15 @@ class OptimisedGraph:
     @property
     def accepted(self) -> PoseGraph:
         """Return the graph without the edges that contradict it, beyond their 99 % bound."""
-        return replace(self.graph, edges=tuple(
-            edge for edge, trust in zip(self.graph.edges, self.trust) if trust >= _REJECTED))
+        return replace(self.graph, edges=tuple(compress(self.graph.edges, self._kept)))
 
     def rejected(self, kind: str) -> int:
         """Return the number of edges of a kind that are not in the accepted graph."""
-        return sum(edge.kind == kind for edge in self.graph.edges) - sum(
-            edge.kind == kind for edge in self.accepted.edges)
+        return sum(edge.kind == kind for edge in compress(self.graph.edges, ~self._kept))
+
+    @property
+    def _kept(self) -> NDArray[np.bool_]:
+        return np.asarray(self.trust >= _REJECTED)
 
 
 def optimise(graph: PoseGraph, first: float = 1.0) -> OptimisedGraph:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from djet_ros.core.cells import CAUTIOUS_INFLATION, CELL
-from djet_ros.core.geometry import inverse_depths, rays
+from djet_ros.core.geometry import depths_in_second, inverse_depths, rays
 from djet_ros.core.types import Array, RelativePose
 from djet_ros.odometry.scale import Length, unknown
 import numpy as np
@@ -102,7 +102,7 @@ class _Depths(NamedTuple):
 
 def _from(inverse: Array, x: Array, R: Array, t: Array, K: Array) -> Array:
     """Return the inverse depths (M,) of pixels x (M, 2) in a second view (R, t); NaN behind it."""
-    ahead = (rays(K, x) @ R.T)[:, 2] + inverse * t[2]
+    ahead = depths_in_second(R, t, rays(K, x), inverse)
     return np.asarray(inverse / np.where(ahead > 0, ahead, np.nan))
 
 
