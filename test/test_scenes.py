@@ -131,7 +131,8 @@ def test_every_scene_starts_at_the_identity_and_moves_smoothly(name: str) -> Non
     steps = np.linalg.inv(poses[:-1]) @ poses[1:]
     angles = np.arccos(np.clip((np.trace(steps[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
     assert np.degrees(angles).max() < (16 if name == 'whip' else 5)
-    assert np.linalg.norm(steps[:, :3, 3], axis=1).max() < 1.4
+    fastest = {'motorway': 3.1, 'flight': 4.5}.get(name, 1.4)
+    assert np.linalg.norm(steps[:, :3, 3], axis=1).max() < fastest
 
 
 def test_standing_still_only_the_noise_changes() -> None:

@@ -18,12 +18,14 @@ from djet_ros.lab.scenes.camera import (
     SensorNoise,
 )
 from djet_ros.lab.scenes.excursions import (
+    build_flight,
     build_forest,
     build_handheld,
     build_indoor,
     build_whip,
 )
-from djet_ros.lab.scenes.panel import Mover, World
+from djet_ros.lab.scenes.motorway import motorway, OWN_LANE, traffic
+from djet_ros.lab.scenes.panel import Mover, Panel, World
 from djet_ros.lab.scenes.route import (
     Dive,
     Drive,
@@ -124,9 +126,12 @@ def _street_scene(name: str, seed: int, size: tuple[int, int], path: Trajectory 
 
 
 def _drive() -> Drive:
-    route = _road()
+    return Drive(_without_outlook(_road()), speed=1.0, lane=_LANE)
+
+
+def _without_outlook(route: Route) -> Route:
     end = int(len(route.curvature) * (1 - _OUTLOOK / route.length))
-    return Drive(Route(route.curvature[:end]), speed=1.0, lane=_LANE)
+    return Route(route.curvature[:end])
 
 
 def _on_the_spot(rate: float) -> Turntable:
@@ -237,6 +242,23 @@ def _build_sharp_turn(seed: int, size: tuple[int, int]) -> Scene:
 
 
 @cache
+def _motorway_route() -> Route:
+    return winding(600 + _OUTLOOK, 0.12, (420, 310))
+
+
+@lru_cache(maxsize=1)
+def _motorway_panels(seed: int) -> tuple[Panel, ...]:
+    return motorway(_motorway_route(), np.random.default_rng([seed, 14]))
+
+
+def _build_motorway(seed: int, size: tuple[int, int]) -> Scene:
+    route = _motorway_route()
+    path = Drive(_without_outlook(route), speed=3.0, lane=OWN_LANE)
+    movers = traffic(route, np.random.default_rng([seed, 15]), path.station)
+    return _street_scene('motorway', seed, size, path, World(_motorway_panels(seed), movers))
+
+
+@cache
 def _dive_route() -> Route:
     return winding(80, 0.5, (47, 31))
 
@@ -285,4 +307,8 @@ SCENES: dict[str, Entry] = {
                   'camera swung back and forth in the study, 15 deg per frame'),
     'traffic': Entry(14, 60, _CAR_SIZE, _build_traffic,
                      'stationary camera at a street with crossing lorries', parallax=False),
+    'flight': Entry(15, 60, _HAND_SIZE, build_flight,
+                    'drone over flat fields, through a narrow lens'),
+    'motorway': Entry(16, 60, _CAR_SIZE, _build_motorway,
+                      'motorway at 3 m per frame, among vehicles of about that speed'),
 }

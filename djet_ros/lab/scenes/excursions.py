@@ -7,6 +7,7 @@ from functools import cache, lru_cache
 from djet_ros.core.types import Array
 from djet_ros.lab.scenes import corridor as inside
 from djet_ros.lab.scenes.camera import Haze, SensorNoise
+from djet_ros.lab.scenes.flight import fields, Flight
 from djet_ros.lab.scenes.forest import forest
 from djet_ros.lab.scenes.panel import Panel, World
 from djet_ros.lab.scenes.reflection import Gloss
@@ -76,3 +77,15 @@ def build_forest(seed: int, size: tuple[int, int]) -> Scene:
     path = Walk(_path(), speed=0.22, height=1.4, tilt=0.1, glance=0.08, seed=seed)
     return Scene('forest', _forest(seed), path, centred_camera(size, 0.7), size, seed,
                  background=225.0, effects=(Haze(70, 190), SensorNoise(1.0, 0.08)))
+
+
+@lru_cache(maxsize=2)
+def _fields(seed: int) -> World:
+    return World(fields(np.random.default_rng([seed, 13])))
+
+
+def build_flight(seed: int, size: tuple[int, int]) -> Scene:
+    """Fly over flat fields and look down through a narrow lens."""
+    path = Flight(speed=1.5, height=30.0, tilt=np.deg2rad(60), seed=seed)
+    return Scene('flight', _fields(seed), path, centred_camera(size, 1.25), size, seed,
+                 background=200.0, effects=(SensorNoise(1.0, 0.08),))
