@@ -87,11 +87,13 @@ def _as_completed(futures: Iterable[Future[R]]) -> Iterator[Future[R]]:
     Yield futures as they complete.
 
     The system may deliver Ctrl-C to any thread without waking the main one, which therefore wakes
-    regularly to handle it.
+    regularly to handle it. Not inside of ``wait``: an exception there may leave a future locked, and
+    the pool would wait for it forever.
     """
     left = set(futures)
     while left:
-        ended, left = wait(left, _SIGNAL_DELAY_S, FIRST_COMPLETED)
+        with _interrupt_after():
+            ended, left = wait(left, _SIGNAL_DELAY_S, FIRST_COMPLETED)
         yield from ended
 
 
