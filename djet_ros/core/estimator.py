@@ -21,6 +21,7 @@ from djet_ros.core.memory import keep_freed_memory
 from djet_ros.core.pair import Limits, Observer, Pair
 from djet_ros.core.parallel import run_both
 from djet_ros.core.radial import undistort_image
+from djet_ros.core.rivals import MIN_BODY_SHARE
 from djet_ros.core.starts import (
     external_starts,
     five_point,
@@ -35,9 +36,10 @@ from djet_ros.core.surfaces import (
     ReprojectionSurface,
     ResidualSurface,
 )
+from djet_ros.core.three_views import of_followed_body
 from djet_ros.core.tracking import track_jointly
 from djet_ros.core.types import Array, Features, of_same_camera, Pose, RelativePose, Status, View
-from djet_ros.core.verdict import verdict
+from djet_ros.core.verdict import verdict, with_left_out
 import numpy as np
 from numpy.typing import NDArray
 
@@ -127,9 +129,25 @@ class TwoViewEstimator:
         # Otherwise match in the whole search radius.
         with _timed(timings, 'matching'):
             x, y = match_widely(previous, current, prior, known, self.config.search_radius)
-        sought = len(previous.features.with_additional)
-        return self.estimate_pair(Pair(previous, current, x, y, _prior_pose(prior), known,
-                                       sought=sought, timings=timings))
+        pair = Pair(previous, current, x, y, _prior_pose(prior), known,
+                    sought=len(previous.features.with_additional), timings=timings)
+        # If another body moved in the previous pair, go on with the one that it followed: by now
+        # most matches may be of the other one, or fit a compromise.
+        followed = None if prior is None else self._estimate_followed(pair, prior)
+        return self.estimate_pair(pair) if followed is None else followed
+
+    def _estimate_followed(self, pair: Pair, prior: RelativePose) -> RelativePose | None:
+        """
+        Estimate the motion of the body that the previous pair followed, from its matches alone.
+
+        None if no other body moved, or if the matches do not fit one motion as before.
+        """
+        followed = of_followed_body(prior, pair.x)
+        if (~followed).sum() <= MIN_BODY_SHARE * len(followed):
+            return None
+        result = self.estimate_pair(pair.without(~followed))
+        within = _within_limits(result, _limits_from(prior))
+        return with_left_out(result, pair, followed) if within else None
 
     def match(self, previous: View, current: View) -> Matches:
         """Match the features of two views: pixels x and y (N, 2), the most reliable first."""

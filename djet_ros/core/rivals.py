@@ -37,9 +37,8 @@ _STEPS = 6
 # an inlier.
 _OUTLIER, _INLIER = 6.0, 3.0
 
-# chosen: a body with less than this share of the matches of the first motion is not mistaken for
-# the static world.
-_MIN_SHARE = 0.125
+# chosen: a body with less than this share of the matches is not mistaken for the static world.
+MIN_BODY_SHARE = 0.125
 
 # chosen: translation directions on a hemisphere from which a second motion is sought.
 _DIRECTIONS = 10
@@ -218,7 +217,7 @@ def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
     scale = min(max(robust_scale(lines.r[0]), scale), 3 * scale)
     distances = _distances(problem, replace(lines, t=first.t[None]))
     outliers = np.flatnonzero(distances > _OUTLIER * scale)
-    least = max(least, round(_MIN_SHARE * (distances < _INLIER * scale).sum()))
+    least = max(least, round(MIN_BODY_SHARE * (distances < _INLIER * scale).sum()))
     if len(outliers) < least:
         return None
     pose = _fit_motion(problem.subset(outliers), first, scale)
@@ -260,7 +259,7 @@ def motion_without_attached(problem: JetProblem, fixed: NDArray[np.bool_], pose:
     where the search starts; scale: robust standard deviation of the inliers' residuals; least: see
     ``second_motion``; prior: the previous motion.
     """
-    least = max(least, round(_MIN_SHARE * len(fixed)))
+    least = max(least, round(MIN_BODY_SHARE * len(fixed)))
     if min(fixed.sum(), (~fixed).sum()) < least:
         return None
     moving = problem.subset(~fixed)

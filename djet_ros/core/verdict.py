@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from djet_ros.core.algorithm import ALGORITHM_TUNING, Track
 from djet_ros.core.covariance import (
@@ -32,6 +32,7 @@ from djet_ros.core.hamming import match_distances
 from djet_ros.core.jet import epipolar_residuals
 from djet_ros.core.pair import Pair
 from djet_ros.core.paraboloid import median, quantile
+from djet_ros.core.patches import unaligned
 from djet_ros.core.rivals import (
     continues_motion,
     false_alarms,
@@ -41,6 +42,7 @@ from djet_ros.core.rivals import (
 )
 from djet_ros.core.types import Array, Pose, RelativePose, Status
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtr
 
 # Median descriptor distance of the inliers, in bits, above which they are no better than random:
@@ -120,6 +122,29 @@ def as_decided(relative: RelativePose) -> RelativePose:
     own = relative.own_covariance_5
     return replace(relative, status=Status.OK, rivals=(), covariance_5=own,
                    covariance_6=lifted_covariance(own, relative.t))
+
+
+def with_left_out(relative: RelativePose, pair: Pair, kept: NDArray[np.bool_]) -> RelativePose:
+    """
+    Return a pair that was estimated from some of its matches with the others as outliers.
+
+    pair: with all matches (N,); kept: (N,) bool, those it was estimated from.
+    """
+    def all_of(values: NDArray[Any], others: NDArray[Any]) -> NDArray[Any]:
+        others = others.copy()
+        others[kept] = values
+        return others
+
+    unplaced, unknown = unaligned(pair.y), np.full(len(kept), np.nan)
+    none = np.zeros(len(kept), bool)
+    lines = epipolar_lines(fundamental(pair.current.K, relative.R, relative.t), pair.x)
+    return replace(
+        relative, x=pair.x, y=pair.y, y_opt=all_of(relative.y_opt, pair.y),
+        inliers=all_of(relative.inliers, none), voting=all_of(relative.voting, none),
+        placed=all_of(relative.placed, unplaced.places),
+        placed_covariances=all_of(relative.placed_covariances, unplaced.covariances),
+        residuals=all_of(relative.residuals, line_distances(lines, pair.y)),
+        hamming=all_of(relative.hamming, unknown), losses=all_of(relative.losses, unknown))
 
 
 def as_pure_rotation(relative: RelativePose, K: Array) -> RelativePose:
