@@ -30,7 +30,7 @@ from djet_ros.lab.store import in_order, RecordStore
 PAIRS_PER_CHUNK = 5
 
 # Longest delay in seconds of the reaction to Ctrl-C.
-_SIGNAL_DELAY_S = 1.0
+_SIGNAL_DELAY_S = 0.2
 
 
 class Chunk(Protocol):
@@ -87,8 +87,8 @@ def _as_completed(futures: Iterable[Future[R]]) -> Iterator[Future[R]]:
     Yield futures as they complete.
 
     The system may deliver Ctrl-C to any thread without waking the main one, which therefore wakes
-    regularly to handle it. Not inside of ``wait``: an exception there may leave a future locked, and
-    the pool would wait for it forever.
+    regularly to handle it. Not inside of ``wait``: an exception there may leave a future locked,
+    and the pool would wait for it forever.
     """
     left = set(futures)
     while left:
