@@ -33,7 +33,8 @@ lint: $(VENV)/.installed-lint
 	$(VENV)/bin/flake8
 	$(VENV)/bin/mypy
 
-# the tests, but for the slow ones, on the oldest versions that setup.py allows
+# on the oldest versions that setup.py allows, the tests of what depends on them: numerics,
+# compiled loops, decoding, bags, parameters, replay, live session; all others are marked slow
 lowest: $(LOWEST)/.installed-test
 	$(LOWEST)/bin/$(PYTEST) -m 'not slow'
 

@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope='module')
 def road(tmp_path_factory: pytest.TempPathFactory) -> Dataset:

@@ -125,6 +125,7 @@ def test_the_imu_offset_corrects_the_clock_of_a_gyro(drive: Drive) -> None:
     assert true == known != unknown
 
 
+@pytest.mark.slow
 def test_a_gyro_continues_the_orientation_through_darkness() -> None:
     """A camera is stationary for three seconds, starts, and has black images for another two."""
     drive, dark = Drive(frames=30, standing=30), tuple(range(36, 56))
@@ -318,6 +319,7 @@ def test_an_image_does_not_wait_for_a_gyro_that_is_silent(live: Any, drive: Driv
     assert monotonic() - start < 3
 
 
+@pytest.mark.slow
 def test_queued_images_still_have_their_samples(live: Any, drive: Drive) -> None:
     session, one, graph = live(**{'odometry.mask': True})
     all_free = np.full(SIZE[::-1], 255, np.uint8)

@@ -13,6 +13,8 @@ from djet_ros.recordings.bag_writers import write_kitti_bag
 from djet_ros.recordings.kitti import KittiSequence
 import pytest
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope='module')
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -68,7 +70,6 @@ def test_stages_are_positive_and_add_up_to_the_time_of_a_pair(output):
         assert 0.9 < sum(run['stages_ms'].values()) * run['pairs_per_second'] / 1e3 < 1
 
 
-@pytest.mark.slow
 def test_a_bag_is_measured_like_the_folder_that_it_was_made_of(sequence, output, tmp_path):
     write_kitti_bag(KittiSequence(sequence), tmp_path / 'bag')
     run = bench(tmp_path / 'bag', '--output', tmp_path / 'bag.json', '--pairs', 2)

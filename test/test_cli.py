@@ -1,15 +1,19 @@
-"""The ``djet`` command in real processes: help, errors, signals."""
+"""The ``djet`` command: help, errors, and in real processes its signals."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 import signal
 import subprocess
 import sys
 
+from commands import djet
 import djet_ros
 from djet_ros.cli.main import COMMANDS, LAB, main
 import pytest
+
+pytestmark = pytest.mark.slow
 
 # The command as pip's script calls it, and the same with one more subcommand.
 DJET = 'import sys; from djet_ros.cli.main import main; sys.exit(main())'
@@ -30,10 +34,10 @@ sys.exit(main(['probe']))
 """
 
 
-def djet(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run the command to its end."""
+def djet_alone(*arguments: str, **settings: str) -> subprocess.CompletedProcess[str]:
+    """Run the command in a process of its own, with these variables of the environment."""
     return subprocess.run([sys.executable, '-c', DJET, *arguments], capture_output=True,
-                          text=True, timeout=60, check=False)
+                          text=True, timeout=60, check=False, env={**os.environ, **settings})
 
 
 def start_probe(body: str, *before: str) -> subprocess.Popen[str]:
@@ -74,11 +78,15 @@ def test_every_command_has_help(command: str) -> None:
 
 
 @pytest.mark.parametrize('command', [*COMMANDS, *(f'lab {verb}' for verb in LAB)])
-def test_help_is_shown_where_only_ascii_is_possible(
-        command: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv('PYTHONIOENCODING', 'ascii')
-    answer = djet(*command.split(), '--help')
+def test_help_is_shown_where_only_ascii_is_possible(command: str) -> None:
+    answer = djet(*command.split(), '--help', encoding='ascii')
     assert (answer.returncode, answer.stderr) == (0, '')
+
+
+def test_a_process_shows_help_where_only_ascii_is_possible() -> None:
+    answer = djet_alone('slam', '--help', PYTHONIOENCODING='ascii')
+    assert (answer.returncode, answer.stderr) == (0, '')
+    assert answer.stdout.startswith('usage: djet slam ')
 
 
 def test_the_help_of_surfaces_has_the_defaults_of_its_own_preset() -> None:
@@ -91,7 +99,7 @@ def test_the_help_of_surfaces_has_the_defaults_of_its_own_preset() -> None:
 
 
 def test_the_version_is_the_packages() -> None:
-    assert djet('--version').stdout == f'djet_ros {djet_ros.__version__}\n'
+    assert djet_alone('--version').stdout == f'djet_ros {djet_ros.__version__}\n'
 
 
 @pytest.mark.parametrize('arguments', [

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-import subprocess
-import sys
+from subprocess import CompletedProcess
 
+import commands
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.lab.closure import closure_rotation, closures, summary
 from djet_ros.lab.scenes.sequence import render_sequence
@@ -14,6 +14,8 @@ from djet_ros.recordings.datasets import open_sequence
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+
+pytestmark = pytest.mark.slow
 
 FRAMES = 6
 
@@ -23,10 +25,8 @@ def road(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return render_sequence('road', tmp_path_factory.mktemp('road'), FRAMES, size=(620, 188))
 
 
-def djet(*arguments: object) -> subprocess.CompletedProcess[str]:
-    code = 'import sys; from djet_ros.cli.main import main; sys.exit(main())'
-    return subprocess.run([sys.executable, '-c', code, 'lab', 'closure', *map(str, arguments)],
-                          capture_output=True, text=True, timeout=300, check=False)
+def djet(*arguments: object) -> CompletedProcess[str]:
+    return commands.djet('lab', 'closure', *arguments)
 
 
 def motion(R: Rotation, sigma: float) -> RelativePose:

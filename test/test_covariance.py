@@ -75,6 +75,7 @@ def test_a_calibration_error_moves_a_pose_as_its_covariance_predicts(camera, t):
     np.testing.assert_array_less(np.abs(estimated - moves @ moves.T), 0.05 * np.outer(size, size))
 
 
+@pytest.mark.slow
 def test_covariance_is_consistent_with_calibration_errors():
     # Half a pixel, as between conventions of the pixel centre, is ten times the error of a pair
     # with the correct calibration.
@@ -166,6 +167,7 @@ def test_a_pose_that_depends_on_one_match_is_undetermined():
     assert np.isnan(pose_covariance(residuals, Loss(), places, t, False)[0]).all()
 
 
+@pytest.mark.slow
 def test_minima_do_not_follow_small_displacements_of_their_keypoints():
     pair = render_pair('road', 5, seed=1, size=(620, 188))
     estimator = TwoViewEstimator()

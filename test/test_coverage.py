@@ -6,10 +6,10 @@ from dataclasses import asdict
 from importlib.util import module_from_spec, spec_from_file_location
 import json
 from pathlib import Path
-import subprocess
-import sys
+from subprocess import CompletedProcess
 from types import ModuleType
 
+import commands
 from djet_ros.core.geometry import rotation_exp, sphere_tangents, unit
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.lab.coverage import (
@@ -24,11 +24,11 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
+pytestmark = pytest.mark.slow
 
-def djet(*arguments: object) -> subprocess.CompletedProcess[str]:
-    code = 'import sys; from djet_ros.cli.main import main; sys.exit(main())'
-    return subprocess.run([sys.executable, '-c', code, 'lab', 'coverage', *map(str, arguments)],
-                          capture_output=True, text=True, timeout=300, check=False)
+
+def djet(*arguments: object) -> CompletedProcess[str]:
+    return commands.djet('lab', 'coverage', *arguments)
 
 
 def record(square: float = 1.0, failed: bool = False, claims: tuple[float, float] = (0.1, 1.0),
@@ -133,7 +133,6 @@ def recorder() -> ModuleType:
     return module
 
 
-@pytest.mark.slow
 def test_the_command_renders_measures_and_resumes(tmp_path: Path) -> None:
     command = ('--scenes', 'road', '--seeds', '1', '--frames', 4, '--output', tmp_path,
                '--workers', 1)

@@ -27,6 +27,8 @@ from numpy.typing import NDArray
 import pytest
 import yaml
 
+pytestmark = pytest.mark.slow
+
 Gray = NDArray[np.uint8]
 BOUNDS = Path(__file__).parents[1] / 'doc' / 'bounds.yaml'
 K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])

@@ -354,6 +354,7 @@ def test_descriptors_do_better_than_points_with_the_same_matches_on_rendered_fra
     assert (points < errors['five_point'].mean(0)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('scene', ['rotation', 'standstill'])
 @pytest.mark.parametrize(('method', 'first'), [('djet', 3), ('pjet', 3), ('rpe', 0)])
 def test_a_rendered_static_camera_has_no_parallax(scene, method, first):

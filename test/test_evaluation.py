@@ -1,4 +1,4 @@
-"""``djet lab evaluate`` and ``djet lab ablate`` on rendered frames, mostly in real processes."""
+"""``djet lab evaluate`` and ``djet lab ablate`` on rendered frames, with real workers."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ import subprocess
 import sys
 from time import monotonic, sleep
 
+import commands
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig, preset
@@ -41,6 +42,8 @@ from djet_ros.recordings.trajectories import read_tum
 from djet_ros.replay.drift import drift
 import numpy as np
 import pytest
+
+pytestmark = pytest.mark.slow
 
 DJET = [sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; sys.exit(main())']
 COLUMNS = ['sequence', 'method', 'preset', 'pairs', 'failures', 'rotation_told',
@@ -77,7 +80,12 @@ def short(road: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def djet(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """Run the command to its end."""
+    """Run the command to its end; its workers are processes of their own."""
+    return commands.djet('lab', *arguments)
+
+
+def djet_alone(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Run the command in a process of its own: a client of Dask leaves threads behind."""
     return subprocess.run([*DJET, 'lab', *map(str, arguments)], capture_output=True, text=True,
                           timeout=300, check=False)
 
@@ -95,7 +103,6 @@ def without_times(path: Path) -> list[dict[str, str]]:
 
 # Tables and records
 
-@pytest.mark.slow
 def test_the_table_has_a_row_for_each_method_and_preset(evaluated):
     table = rows(evaluated / 'table1.csv')
     assert list(table[0]) == COLUMNS
@@ -309,7 +316,6 @@ def test_no_method_has_features_where_the_lens_shows_nothing(road, tmp_path):
             assert len(points) > 50 and not unseen[y, x].any()
 
 
-@pytest.mark.slow
 def test_a_bag_gives_the_errors_of_the_folder_that_it_was_made_of(road, tmp_path):
     write_kitti_bag(KittiSequence(road, end=4), tmp_path / 'bag')
     answer = djet('evaluate', tmp_path / 'bag', road, '--end', '4', '--methods', 'djet',
@@ -339,7 +345,6 @@ def test_a_folder_of_sequences_gives_all_of_them_with_distinct_names(road, tmp_p
 
 # Running on workers
 
-@pytest.mark.slow
 def test_one_and_two_workers_write_the_same_bytes(road, short, tmp_path):
     assert djet('evaluate', road, '--output', tmp_path, '--workers', '2', *RUN).returncode == 0
     assert (tmp_path / 'pairs.csv').read_bytes() == (short / 'pairs.csv').read_bytes()
@@ -350,8 +355,8 @@ def test_a_dask_cluster_writes_the_same_bytes(road, short, tmp_path):
     distributed = pytest.importorskip('distributed')
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, host='127.0.0.1',
                                   dashboard_address=None) as cluster:
-        answer = djet('evaluate', road, '--output', tmp_path,
-                      '--scheduler', cluster.scheduler_address, *RUN)
+        answer = djet_alone('evaluate', road, '--output', tmp_path,
+                            '--scheduler', cluster.scheduler_address, *RUN)
     assert answer.returncode == 0, answer.stderr
     assert (tmp_path / 'pairs.csv').read_bytes() == (short / 'pairs.csv').read_bytes()
 
@@ -396,7 +401,6 @@ def called(process: str) -> bytes:
         return b''
 
 
-@pytest.mark.slow
 def test_a_killed_run_is_resumed(road, short, running, tmp_path):
     children = workers_of(running)
     running.kill()
@@ -413,7 +417,6 @@ def test_a_killed_run_is_resumed(road, short, running, tmp_path):
     assert (tmp_path / 'pairs.csv').read_bytes() == (short / 'pairs.csv').read_bytes()
 
 
-@pytest.mark.slow
 def test_the_death_of_a_worker_is_reported_and_loses_only_its_chunk(
         road, short, running, tmp_path):
     for worker in workers_of(running):
@@ -486,7 +489,6 @@ def test_ctrl_c_in_a_terminal_ends_all_processes_at_once_in_one_line(verb, momen
     wait_for(lambda: not any(Path(f'/proc/{worker}').exists() for worker in workers))
 
 
-@pytest.mark.slow
 def test_results_of_other_settings_are_not_mixed(road, tmp_path):
     run = ('evaluate', road, '--end', '3', '--presets', 'best', '--output', tmp_path)
     assert djet(*run, '--methods', 'djet').returncode == 0
@@ -514,7 +516,6 @@ def test_results_of_other_code_or_libraries_are_not_mixed(other, tmp_path):
         RecordStore(tmp_path, PairRecord, {'methods': ['djet']})
 
 
-@pytest.mark.slow
 def test_a_damaged_store_is_named(road, tmp_path):
     run = ('evaluate', road, '--end', '3', '--presets', 'best', '--methods', 'five_point',
            '--output', tmp_path)
@@ -563,8 +564,8 @@ def test_missing_poses_are_one_line_and_exit_code_2(small_kitti, tmp_path):
 def test_an_absent_scheduler_is_one_line_and_keeps_earlier_records(road, tmp_path):
     pytest.importorskip('distributed')
     (tmp_path / 'records.jsonl').write_text('of an earlier run\n')
-    answer = djet('evaluate', road, '--end', '3', '--output', tmp_path, '--overwrite',
-                  '--scheduler', 'tcp://127.0.0.1:9')
+    answer = djet_alone('evaluate', road, '--end', '3', '--output', tmp_path, '--overwrite',
+                        '--scheduler', 'tcp://127.0.0.1:9')
     assert (tmp_path / 'records.jsonl').read_text() == 'of an earlier run\n'
     assert answer.returncode == 2
     assert "no Dask scheduler answers at 'tcp://127.0.0.1:9'" in answer.stderr.splitlines()[-1]
@@ -607,7 +608,6 @@ def test_evo_finds_no_error_in_the_ground_truth(evaluated):
 
 # Ablation
 
-@pytest.mark.slow
 def test_an_ablation_has_a_row_for_each_change(road, tmp_path):
     answer = djet('ablate', road, '--end', '4', '--output', tmp_path, '--windows', '3,5',
                   '--parts', 'window,recentring,starts', '--presets', 'best,paper')

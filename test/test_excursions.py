@@ -23,6 +23,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_scenes import clean, shifts
 
+pytestmark = pytest.mark.slow
+
 NAMES = ('indoor', 'handheld', 'forest')
 SMALL = (480, 360)
 TINY = (160, 120)

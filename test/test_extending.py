@@ -16,6 +16,8 @@ from djet_ros.lab.summary import table_rows
 from djet_ros.lab.tables import results_table
 import pytest
 
+pytestmark = pytest.mark.slow
+
 PAGE = Path(__file__).parents[1] / 'doc' / 'extending.md'
 
 

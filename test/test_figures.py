@@ -111,6 +111,7 @@ def test_an_animation_has_a_frame_for_each_round(road, tmp_path, capsys):
     assert PIL.open(still).size[0] > 500
 
 
+@pytest.mark.slow
 def test_two_images_and_a_camera_give_the_same_as_a_sequence(road, tmp_path, capsys):
     images = [str(road / 'image_0' / f'{i:06d}.png') for i in (1, 2)]
     K = KittiSequence(road).K
@@ -161,6 +162,7 @@ def without_screen():
     return {'PATH': '', 'PYTHONPATH': os.pathsep.join(filter(None, sys.path))}
 
 
+@pytest.mark.slow
 def test_drawing_needs_no_screen(road, tmp_path):
     draw = ('import sys; from djet_ros.cli.main import main; '
             f'sys.exit(main(["lab", "similarity", {str(road / "image_0" / "000000.png")!r}]))')

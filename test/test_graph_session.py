@@ -11,6 +11,8 @@ from ros_messages import camera_info, image, message_type
 from test_live_slam import MOUNTING, Odometry, START
 from test_session import Graph
 
+pytestmark = pytest.mark.slow
+
 TOPICS = {'odometry': '/vo_node/odometry', 'relative_pose_cov': '/vo_node/relative_pose_cov',
           'relative_pose_status': '/vo_node/relative_pose_status',
           'image': '/left/image_raw', 'camera_info': '/left/camera_info'}

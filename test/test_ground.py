@@ -132,6 +132,7 @@ def test_the_pitch_may_be_slightly_wrong(floor):
     assert seen.value[1] == pytest.approx(pitch, abs=np.radians(0.5))
 
 
+@pytest.mark.slow
 def test_the_covariance_of_one_pair_is_consistent_over_many():
     """Other floors, other noise, and motions that are off by as much as they say."""
     rng, ground, errors = np.random.default_rng(3), Ground(K, SIZE[::-1], 0.0), []
@@ -348,6 +349,7 @@ def test_pitching_of_the_vehicle_does_not_bias_lengths(floor, pitches):
     assert np.sqrt(np.mean(off**2)) < 0.015
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('radius', [400.0, -400.0])
 def test_a_vehicle_that_pitches_with_the_road_is_on_a_hill(radius):
     """

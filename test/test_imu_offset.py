@@ -66,6 +66,7 @@ def test_clocks_far_apart_are_reported() -> None:
         fit_imu(seen(poses, 1e-5), felt.stamps_ns + 500 * 10**9, felt.rates)
 
 
+@pytest.mark.slow
 def test_the_command_prints_lines_for_a_parameter_file(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = render_sequence('handheld', tmp_path, 30, 0, (320, 240))

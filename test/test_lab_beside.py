@@ -23,6 +23,8 @@ from djet_ros.replay.pair_errors import angle_errors
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.slow
+
 
 def moment(frame: int = 1, aid: str = GYRO, seed: int = 0, dark: bool = False,
            tracked: bool = True, failed: bool = False, off: float = 0.1, bias: float = 0.02
@@ -150,7 +152,6 @@ def test_static_features_prove_a_standstill_while_lorries_hide_nearly_all(seed: 
     assert all(result.stationary for result in results[1:])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('seed', [102, 106])
 def test_depths_of_a_lorry_do_not_contradict_a_motion_that_a_gyro_confirms(seed: int) -> None:
     scene = make_scene('moving_object', seed)
@@ -168,7 +169,6 @@ def test_at_the_start_a_camera_moves_without_rotation_if_no_feature_is_static() 
     assert [result.status for result in results[1:]] == [Status.OK] * 5
 
 
-@pytest.mark.slow
 def test_a_lorry_that_hides_everything_does_not_move_a_stationary_camera() -> None:
     seen = set()
     for seed in (70, 71, 73):

@@ -25,6 +25,8 @@ from numpy.typing import NDArray
 import pytest
 from scipy.stats import chi2
 
+pytestmark = pytest.mark.slow
+
 Poses = NDArray[np.float64]
 
 

@@ -105,6 +105,7 @@ def test_a_wide_lens_is_estimated_without_any_calibration(k1: float) -> None:
     assert abs(fit.k1 - k1) < 4 * fit.sigma and fit.sigma < 6e-3
 
 
+@pytest.mark.slow
 def test_near_a_fold_of_the_image_there_is_no_estimate() -> None:
     with pytest.raises(DjetError, match='no k1 was found'):
         lens.trusted_fit(seen_pairs(0, TURNS, -0.389), CAMERA)
@@ -194,6 +195,7 @@ def row_of(printed: str) -> str:
     return next(line for line in printed.splitlines() if line.startswith('D: '))
 
 
+@pytest.mark.slow
 def test_a_correct_calibration_is_kept(
         whip: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'lens.yaml').write_text('of an earlier run')
@@ -248,6 +250,7 @@ def tracked(sequence: Path, k1: float = 0.0) -> Array:
     return np.array(poses)
 
 
+@pytest.mark.slow
 def test_without_residual_distortion_poses_are_right_and_keep_their_scale(
         tmp_path: Path) -> None:
     walk = render_sequence('handheld', tmp_path, 16, size=(480, 360))
@@ -382,6 +385,7 @@ def test_results_of_others_are_not_replaced(
     assert (tmp_path / 'lens.yaml').read_text() == 'mine'
 
 
+@pytest.mark.slow
 def test_the_slow_turn_of_kitti_03_determines_the_remaining_distortion(kitti: Path) -> None:
     sequence = KittiSequence(kitti / 'sequences' / '03', start=50, end=116)
     report = lens.examine(SequenceRecording(sequence), Config(), lambda: None)

@@ -495,6 +495,7 @@ def in_memory(kind):
     return sum(type(one) is kind for one in gc.get_objects())
 
 
+@pytest.mark.slow
 def test_map_memory_is_bounded(live):
     image_type = message_type('sensor_msgs/msg/Image')
     frames, messages = in_memory(Frame), in_memory(image_type)

@@ -10,6 +10,8 @@ from djet_ros.lab.scenes import make_scene
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.slow
+
 # Page faults of twenty pairs, after as many that have allocated all memory. Single-threaded: on a
 # busy machine another thread may start at any time, and allocate memory of its own.
 ESTIMATES = """

@@ -5,6 +5,7 @@ from djet_ros.odometry.mounting import pose_of_base, twist_of_base
 from djet_ros.odometry.static_frames import StaticFrames
 from djet_ros.recordings.decoding import MAKE
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 # 0.3 m ahead of the base and 1 m above it, looking ahead: z forward, x right, y down.
@@ -40,6 +41,7 @@ def test_a_vehicle_that_rotates_in_place_does_not_move():
     assert np.allclose(velocity, [0, 0, 0, 0, 0, 0.5])
 
 
+@pytest.mark.slow
 def test_covariances_are_those_of_sampled_poses_and_velocities():
     rng = np.random.default_rng(3)
     T, pose, velocity = random_pose(rng), random_pose(rng, 5.0), rng.normal(size=6)

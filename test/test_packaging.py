@@ -19,6 +19,8 @@ from packaging.version import Version
 import pytest
 import yaml
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 NODES = ('vo_node', 'pose_graph_node')
 NOT_SOURCE = shutil.ignore_patterns('.*', '__pycache__', '*.so', '*.egg-info', 'build', 'demo',

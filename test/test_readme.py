@@ -23,6 +23,8 @@ import pytest
 from test_layers import ORDER
 import yaml
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 DOC = ROOT / 'doc'
 PAGES = [ROOT / 'README.md', *sorted(DOC.glob('*.md'))]

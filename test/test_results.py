@@ -25,6 +25,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 import yaml
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 BOUNDS = ROOT / 'doc' / 'bounds.yaml'
 SCENE = 'standstill'
@@ -60,7 +62,6 @@ def part(output: Path) -> Any:
     return json.loads(output.read_text())['parts'][SCENE]
 
 
-@pytest.mark.slow
 def test_every_method_is_measured_on_every_pair(part):
     methods = {one['method'] for one in part['methods']}
     assert {'djet', 'rpe', 'pjet', 'five_point', 'opencv_ransac'} <= methods
@@ -81,7 +82,6 @@ def test_standstill_is_no_failure_and_has_no_direction(part):
     assert part['odometry']['rotation']['max'] < bound
 
 
-@pytest.mark.slow
 def test_measured_parts_are_reused_and_not_mixed_with_other_settings(output, tmp_path):
     begun = tmp_path / 'results.json'
     begun.write_text(output.read_text())

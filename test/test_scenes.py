@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 import pytest
 
+pytestmark = pytest.mark.slow
+
 SMALL = (620, 188)
 TINY = (160, 64)
 DJET = 'import sys; from djet_ros.cli.main import main; sys.exit(main())'

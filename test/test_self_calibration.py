@@ -143,6 +143,7 @@ def tracked_bent(bent: Bent) -> tuple[Tracker, list[OdometryResult]]:
     return bent.tracked()
 
 
+@pytest.mark.slow
 def test_remaining_distortion_is_estimated_in_a_turn_and_reported(
         bent: Bent, tracked_bent: tuple[Tracker, list[OdometryResult]]) -> None:
     tracker, results = tracked_bent
@@ -162,6 +163,7 @@ def test_remaining_distortion_is_estimated_in_a_turn_and_reported(
     assert gained.mean() > 2 * gained.std() / np.sqrt(len(gained))
 
 
+@pytest.mark.slow
 def test_the_back_end_gets_the_lens_of_each_image(
         tracked_bent: tuple[Tracker, list[OdometryResult]], tmp_path: Path) -> None:
     """Loops are the same live, by messages, and later, by results."""
@@ -183,6 +185,7 @@ def test_the_back_end_gets_the_lens_of_each_image(
     assert [step.k1 for step in read_steps(tmp_path / 'results')] == lenses
 
 
+@pytest.mark.slow
 def test_the_estimate_is_reset_with_another_camera(bent: Bent) -> None:
     tracker, _ = bent.tracked()
     assert 'distortion left (k1)' in tracker.diagnosis().values
@@ -197,6 +200,7 @@ def test_the_estimate_is_reset_with_another_camera(bent: Bent) -> None:
     assert tracker.last is not None and tracker.last.status in (Status.OK, Status.TIME_JUMP)
 
 
+@pytest.mark.slow
 def test_corrected_images_are_reproducible_to_the_last_bit(
         bent: Bent, tracked_bent: tuple[Tracker, list[OdometryResult]]) -> None:
     (_, first), (one, second) = tracked_bent, bent.tracked()
@@ -208,6 +212,7 @@ def test_corrected_images_are_reproducible_to_the_last_bit(
     assert one.last is not None and np.array_equal(one.last.pose, first[4].pose)
 
 
+@pytest.mark.slow
 def test_a_good_calibration_is_not_reported() -> None:
     tracker, _ = Bent(0.0).tracked()
     assert 'distortion left (k1)' not in tracker.diagnosis().values

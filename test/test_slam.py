@@ -2,14 +2,12 @@
 
 from dataclasses import replace
 import json
-import os
 import resource
 import shutil
-import subprocess
-import sys
 import tracemalloc
 
 from cards import Cards, K, pose
+import commands
 import cv2
 from djet_ros.config.sections import Config, SlamConfig
 from djet_ros.core.estimator import TwoViewEstimator
@@ -32,16 +30,12 @@ from djet_ros.replay.alignment import aligned, position_rmse
 import numpy as np
 import pytest
 
-DJET = [sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; sys.exit(main())']
-
 SIGMAS = np.array([0.01, 0.01, 0.01, 1e-3, 1e-3, 1e-3])
 
 
 def djet(*arguments, expect=0):
-    done = subprocess.run([*DJET, *map(str, arguments)], capture_output=True, text=True,
-                          timeout=120, check=False, env={**os.environ, 'OMP_NUM_THREADS': '1'})
+    done = commands.djet(*arguments)
     assert done.returncode == expect, done.stderr
-    assert 'Traceback' not in done.stderr
     return done
 
 
@@ -727,6 +721,7 @@ def test_slam_command_accepts_results_and_a_moved_recording(
     djet('slam', moved, '--output', tmp_path / 'moved', '--source', drive, *FLAGS)
 
 
+@pytest.mark.slow
 def test_keyframes_agree_between_messages_and_results(closed, tmp_path):
     from djet_ros.posegraph.step_messages import StepMessages
     from djet_ros.recordings.bags import Bag
@@ -748,6 +743,7 @@ def test_keyframes_agree_between_messages_and_results(closed, tmp_path):
     assert report['keyframes'] == len(chosen)
 
 
+@pytest.mark.slow
 def test_slam_command_keeps_earlier_results_and_parameters(closed, tmp_path):
     refused = djet('slam', closed / 'replay', '--output', closed, *FLAGS, expect=2)
     assert '--overwrite' in refused.stderr
@@ -758,6 +754,7 @@ def test_slam_command_keeps_earlier_results_and_parameters(closed, tmp_path):
     assert 'whose parameters cannot be changed' in refused.stderr
 
 
+@pytest.mark.slow
 def test_a_mistake_in_the_command_costs_no_earlier_results(closed, drive, tmp_path):
     shutil.copytree(closed, tmp_path / 'slam')
     before = {path: path.read_bytes() for path in (tmp_path / 'slam').rglob('*') if path.is_file()}
@@ -774,6 +771,7 @@ def test_a_mistake_in_the_command_costs_no_earlier_results(closed, drive, tmp_pa
                 if path.is_file()} == before
 
 
+@pytest.mark.slow
 def test_overwriting_run_removes_all_earlier_results(closed, drive, tmp_path):
     out = tmp_path / 'slam'
     shutil.copytree(closed, out)
@@ -785,6 +783,7 @@ def test_overwriting_run_removes_all_earlier_results(closed, drive, tmp_path):
     assert (out / 'notes.txt').read_text() == 'mine'
 
 
+@pytest.mark.slow
 def test_links_to_more_keyframes_are_edges_of_unknown_length(closed, tmp_path):
     djet('slam', closed / 'replay', '--output', tmp_path / 'slam', '--links', 2, *FLAGS)
     rows = [row.split(',') for row in (tmp_path / 'slam' / 'pose_graph.csv').read_text(
@@ -808,6 +807,7 @@ def test_gtsam_built_for_another_numpy_is_refused_before_it_crashes(tmp_path, mo
         assert libraries.problem_of('gtsam') == ''
 
 
+@pytest.mark.slow
 def test_the_odometry_is_recommended_if_no_loop_was_closed(drive, tmp_path):
     printed = djet('slam', drive, '--output', tmp_path / 'slam', '--scale', 'ground_truth',
                    *FLAGS[:4], '--loop-gap', 1000).stdout

@@ -21,6 +21,8 @@ from djet_ros.odometry.visual_odometry import VisualOdometry
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 100
 
 
@@ -30,7 +32,6 @@ def djet_soak(*arguments: object) -> subprocess.CompletedProcess[str]:
                           capture_output=True, text=True, timeout=300, check=False)
 
 
-@pytest.mark.slow
 def test_memory_and_latency_are_recorded_and_memory_does_not_grow(tmp_path: Path) -> None:
     output = tmp_path / 'deep' / 'soak.json'
     run = djet_soak('--output', output, '--frames', FRAMES)
@@ -51,7 +52,6 @@ def test_memory_and_latency_are_recorded_and_memory_does_not_grow(tmp_path: Path
     assert output.with_suffix('.png').read_bytes().startswith(b'\x89PNG')
 
 
-@pytest.mark.slow
 def test_no_covariance_of_a_soak_is_zero_infinite_or_absurd() -> None:
     odometry = VisualOdometry(EstimatorConfig(max_features=module.FEATURES), OdometryConfig())
     statuses = set()
@@ -78,7 +78,6 @@ def soak_leaking() -> dict[str, Any]:
     return soak(100, most_growth_mb=10.0)
 
 
-@pytest.mark.slow
 def test_a_leak_is_found() -> None:
     # In a process of its own: what earlier tests have freed here would be taken first, unseen.
     with ProcessPoolExecutor(1, multiprocessing.get_context('spawn')) as fresh:

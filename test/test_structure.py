@@ -192,6 +192,7 @@ def test_a_rotation_in_place_does_not_change_the_expected_length(cards):
     assert drive.odometry._scale._speed == expected
 
 
+@pytest.mark.slow
 def test_a_rotation_beyond_all_landmarks_leaves_the_scale_to_one_guess():
     scene = make_scene('indoor', 0, (320, 240))
     poses, turn = list(scene.trajectory(6)), pose(yaw=0.06)
@@ -445,6 +446,7 @@ def test_pauses_with_hardly_any_motion_do_not_lose_the_scale(seed: int) -> None:
     assert np.std(np.log(lengths[moved] / true_lengths[moved])) < np.log(2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', [0, 1, 4, 6])
 def test_fast_rotations_keep_the_scale(seed: int) -> None:
     """At 15 degrees a frame landmarks leave the view after a few, at times all at once."""

@@ -91,6 +91,7 @@ def test_the_sign_of_t_alone_is_not_decided():
     assert consistent_motion(of_motions(before, *earlier), both, K) is None
 
 
+@pytest.mark.slow
 def test_over_flat_ground_pairs_after_the_first_ones_have_the_true_motion():
     """By themselves a third of them are ambiguous: the lens is too narrow for chirality."""
     estimator, alone, in_a_row = TwoViewEstimator(), [], []

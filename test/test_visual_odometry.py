@@ -110,6 +110,7 @@ def test_after_an_undecided_pair_its_matches_are_not_reused():
     assert np.array_equal(estimator.estimate(*views[3:], motion).x, after.x)
 
 
+@pytest.mark.slow
 def test_a_compromise_between_two_bodies_does_not_persist():
     scene = make_scene('moving_object', size=(620, 188))
     poses = scene.trajectory(6)
@@ -142,6 +143,7 @@ def test_one_bad_frame_is_bridged_by_the_next_good_one(cards):
     assert np.degrees(rotation_angle(bridged.motion[:3, :3], STEP[:3, :3])) < 0.3
 
 
+@pytest.mark.slow
 def test_a_pair_with_an_ambiguous_direction_still_rotates_the_pose():
     rng, doubted = np.random.default_rng(0), []
     for _ in range(24):
@@ -255,6 +257,7 @@ def test_a_motion_that_starts_with_creep_is_counted_from_the_standstill(cards):
     assert moving.previous_stamp_ns == 0
 
 
+@pytest.mark.slow
 def test_a_slow_pan_is_not_taken_for_the_bias_of_a_gyro(cards):
     gyro, rate = Gyro(GyroNoise(2e-4, 2e-5)), 0.008
     gyro.mount(np.eye(3))
@@ -276,6 +279,7 @@ def gyro_of(rate):
     return gyro
 
 
+@pytest.mark.slow
 def test_a_gyro_in_degrees_is_rejected_though_it_misleads_all_matches(cards):
     gyro = gyro_of(np.degrees([0, 0.1, 0]))
     results = drive(VisualOdometry(ESTIMATOR, gyro=gyro), cards, [STEP] * 36)
@@ -438,6 +442,7 @@ def assert_covariance(errors, covariance):
     assert np.allclose(measured / scale, covariance / scale, atol=0.06)
 
 
+@pytest.mark.slow
 def test_the_covariance_of_a_motion_is_that_of_sampled_motions():
     rng = np.random.default_rng(1)
     relative, length = some_relative(rng), Length(2.0, 0.03, True)
@@ -458,6 +463,7 @@ def disturbed(exact, delta):
     return result
 
 
+@pytest.mark.slow
 def test_the_covariance_of_a_composed_pose_is_that_of_sampled_poses():
     rng = np.random.default_rng(2)
     covariances = [S @ S.T for S in rng.normal(size=(2, 6, 6)) * 0.006]

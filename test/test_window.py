@@ -163,6 +163,7 @@ def test_only_keyframes_stay_in_the_window() -> None:
     assert 5 < sum(chosen) < 25
 
 
+@pytest.mark.slow
 def test_noise_does_not_bias_the_scale() -> None:
     lengths = []
     for seed in range(4):
@@ -174,6 +175,7 @@ def test_noise_does_not_bias_the_scale() -> None:
     assert drifts.std() < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('unit', [0.002, 50.0])
 def test_a_track_is_the_same_in_any_unit(unit: float) -> None:
     """The first step defines it: one of a vehicle that starts, or one of metres."""

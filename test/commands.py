@@ -1,0 +1,62 @@
+"""The ``djet`` command in the process of the tests: an interpreter takes longer to start."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+import os
+from subprocess import CompletedProcess
+import sys
+from tempfile import TemporaryFile
+from typing import BinaryIO
+import warnings
+
+from djet_ros.cli.main import main
+
+# those that Python does not show either
+UNSEEN = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
+
+
+@contextmanager
+def redirected(descriptor: int) -> Iterator[BinaryIO]:
+    """Yield a file of all that is written to a descriptor, by libraries in C too."""
+    kept = os.dup(descriptor)
+    with TemporaryFile() as file:
+        os.dup2(file.fileno(), descriptor)
+        try:
+            yield file
+        finally:
+            os.dup2(kept, descriptor)
+            os.close(kept)
+
+
+def djet(*words: object, encoding: str = 'utf-8') -> CompletedProcess[str]:
+    """
+    Run a command to its end, and return what a process with such a stdout would.
+
+    But an exception that the command does not turn into a line is raised.
+    """
+    call = [str(word) for word in words]
+    sys.stdout.flush()
+    sys.stderr.flush()
+    with redirected(1) as out, redirected(2) as err:
+        with open(1, 'w', encoding=encoding, closefd=False) as stdout, \
+                open(2, 'w', buffering=1, encoding='utf-8', errors='backslashreplace',
+                     closefd=False) as stderr, \
+                redirect_stdout(stdout), redirect_stderr(stderr), \
+                warnings.catch_warnings(record=True) as given:
+            warnings.simplefilter('default')
+            for category in UNSEEN:
+                warnings.simplefilter('ignore', category)
+            try:
+                code = main(call)
+            except SystemExit as end:
+                code = int(end.code or 0)
+            for one in given:
+                print(warnings.formatwarning(one.message, one.category, one.filename,
+                                             one.lineno), file=sys.stderr)
+        printed = []
+        for file in (out, err):
+            file.seek(0)
+            printed.append(file.read().decode())
+    return CompletedProcess(call, code, *printed)
