@@ -653,6 +653,8 @@ def drive(tmp_path_factory):
 
 
 FLAGS = ('--keyframes', 'distance', '--keyframe-distance', 0.5, '--loop-gap', 0.5)
+# the same without a search for loops, which takes most of the time
+NO_LOOPS = (*FLAGS[:-1], 1000)
 
 
 @pytest.fixture(scope='module')
@@ -718,7 +720,10 @@ def test_slam_command_accepts_results_and_a_moved_recording(
     (moved / 'summary.json').write_text('{}')
     refused = djet('slam', moved, '--output', tmp_path / 'moved', *FLAGS, expect=2)
     assert 'name it with --source' in refused.stderr
-    djet('slam', moved, '--output', tmp_path / 'moved', '--source', drive, *FLAGS)
+    djet('slam', moved, '--output', tmp_path / 'moved', '--source', drive, *FLAGS[:2],
+         '--keyframe-distance', 1.0, *FLAGS[4:])
+    report = json.loads((tmp_path / 'moved' / 'slam.json').read_text())
+    assert report['edges']['loop'] > 0
 
 
 @pytest.mark.slow
@@ -738,7 +743,7 @@ def test_keyframes_agree_between_messages_and_results(closed, tmp_path):
     chosen = [step.stamp_ns for step in results if step.keyframe]
     assert 3 <= len(chosen) < len(results)
     djet('slam', closed / 'replay', '--output', tmp_path / 'slam', '--keyframes', 'odometry',
-         *FLAGS[2:])
+         *NO_LOOPS[2:])
     report = json.loads((tmp_path / 'slam' / 'slam.json').read_text())
     assert report['keyframes'] == len(chosen)
 
@@ -776,16 +781,16 @@ def test_overwriting_run_removes_all_earlier_results(closed, drive, tmp_path):
     out = tmp_path / 'slam'
     shutil.copytree(closed, out)
     (out / 'notes.txt').write_text('mine')
-    djet('slam', out / 'replay', '--output', out, '--overwrite', '--links', 2, *FLAGS)
+    djet('slam', out / 'replay', '--output', out, '--overwrite', '--links', 2, *NO_LOOPS)
     assert json.loads((out / 'slam.json').read_text())['parameters']['links'] == 2
-    djet('slam', drive, '--output', out, '--overwrite', *FLAGS)
+    djet('slam', drive, '--output', out, '--overwrite', *NO_LOOPS)
     assert json.loads((out / 'slam.json').read_text())['parameters']['links'] != 2
     assert (out / 'notes.txt').read_text() == 'mine'
 
 
 @pytest.mark.slow
 def test_links_to_more_keyframes_are_edges_of_unknown_length(closed, tmp_path):
-    djet('slam', closed / 'replay', '--output', tmp_path / 'slam', '--links', 2, *FLAGS)
+    djet('slam', closed / 'replay', '--output', tmp_path / 'slam', '--links', 2, *NO_LOOPS)
     rows = [row.split(',') for row in (tmp_path / 'slam' / 'pose_graph.csv').read_text(
         ).splitlines()]
     links = [row for row in rows if row[2] == 'link']
@@ -810,5 +815,5 @@ def test_gtsam_built_for_another_numpy_is_refused_before_it_crashes(tmp_path, mo
 @pytest.mark.slow
 def test_the_odometry_is_recommended_if_no_loop_was_closed(drive, tmp_path):
     printed = djet('slam', drive, '--output', tmp_path / 'slam', '--scale', 'ground_truth',
-                   *FLAGS[:4], '--loop-gap', 1000).stdout
+                   *NO_LOOPS).stdout
     assert 'no loop was closed: prefer before_tum.txt' in printed
