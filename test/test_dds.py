@@ -177,7 +177,7 @@ def test_publisher_waits_while_the_queue_is_full(live, peer, drive):
     images = peer.advertise(IMAGE, IMAGE_TYPE, Profile(depth=None))
     infos.publish(camera_info(K, SIZE))
     peer.spin(0.2)
-    sent, waited = 200, 0
+    sent, waited = 120, 0
     for i in range(sent):
         while not images.publish(image(drive[i % len(drive)], stamp_ns=stamp(i))):
             waited += 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from djet_ros.config.sections import Config, OdometryConfig
 from djet_ros.core.geometry import rotation_log
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Status, TRACKED
-from djet_ros.lab.scenes import make_scene
+from djet_ros.lab.scenes import make_scene, Scene
 from djet_ros.odometry.messages import Messages
 from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.tracker import Outgoing, Tracker
@@ -101,18 +102,25 @@ def test_without_distortion_images_are_never_corrected() -> None:
             assert not lens.needs_update
 
 
+@cache
+def rendered_turn(frames: int = 75) -> tuple[Scene, Numbers, list[NDArray[np.uint8]]]:
+    """Return a turn, its poses and its images, of which all lenses are made."""
+    scene = make_scene('sharp_turn', 0, (620, 188))
+    poses = scene.trajectory(frames)
+    return scene, poses, [scene.render(pose, number) for number, pose in enumerate(poses)]
+
+
 class Bent:
     """A rendered turn, seen through a lens with distortion that is not calibrated."""
 
-    def __init__(self, k1: float, frames: int = 75) -> None:
-        scene = make_scene('sharp_turn', 0, (620, 188))
+    def __init__(self, k1: float) -> None:
+        scene, self.poses, images = rendered_turn()
         (width, height), self.K, self.size = scene.size, scene.K, scene.size
-        self.poses = scene.trajectory(frames)
         grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1, dtype=float)
         where = cv2.undistortPoints(grid.reshape(-1, 2), self.K, np.array([k1, 0, 0, 0]), P=self.K)
         where = where.reshape(height, width, 2).astype(np.float32)
-        self.images = [cv2.remap(scene.render(pose, number), where[..., 0], where[..., 1],
-                                 cv2.INTER_CUBIC) for number, pose in enumerate(self.poses)]
+        self.images = [cv2.remap(one, where[..., 0], where[..., 1], cv2.INTER_CUBIC)
+                       for one in images]
 
     def tracked(self, **odometry: Any) -> tuple[Tracker, list[OdometryResult]]:
         """Track it with some parameters."""
