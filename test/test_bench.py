@@ -7,6 +7,7 @@ from pathlib import Path
 import subprocess
 import sys
 
+from commands import djet
 from djet_ros.lab.bench import interleaved_minima
 from djet_ros.lab.scenes.sequence import render_sequence
 from djet_ros.recordings.bag_writers import write_kitti_bag
@@ -85,7 +86,7 @@ def test_a_bag_is_measured_like_the_folder_that_it_was_made_of(sequence, output,
     (('.', '--output', 'a.json', '--pairs', 0), '--pairs is 0')])
 def test_user_errors_are_one_line_and_exit_code_2(tmp_path, arguments, message, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    run = bench(*arguments)
+    run = djet('lab', 'bench', *arguments)
     assert run.returncode == 2
     assert message in run.stderr
     assert run.stderr.count('\n') == 1
@@ -94,7 +95,7 @@ def test_user_errors_are_one_line_and_exit_code_2(tmp_path, arguments, message, 
 def test_figures_are_not_overwritten_silently(sequence, tmp_path):
     output = tmp_path / 'bench.json'
     output.write_text('{}')
-    run = bench(sequence, '--output', output)
+    run = djet('lab', 'bench', sequence, '--output', output)
     assert run.returncode == 2
     assert '--overwrite' in run.stderr
     assert output.read_text() == '{}'

@@ -152,7 +152,7 @@ def test_a_rendered_sequence_is_not_compared_with_the_paper(evaluated):
 
 def test_kitti_sequences_are_compared_with_the_paper(kitti, tmp_path):
     answer = djet('evaluate', kitti / 'sequences' / '06', '--end', '3', '--methods', 'djet,rpe',
-                  '--presets', 'best', '--output', tmp_path)
+                  '--presets', 'best', '--workers', '1', '--output', tmp_path)
     assert answer.returncode == 0, answer.stderr
     assert '| *06* | *the paper* | *RP-E* |  | *0.049* |' in (tmp_path / 'table1.md').read_text()
     # The file for programs holds what was measured, and nothing else.
@@ -190,7 +190,7 @@ def test_drift_is_reported_for_paths_over_100_metres(road, tmp_path):
     write_stretched(KittiSequence(road).poses, 30, tmp_path / 'poses' / 'far.txt')
     output = tmp_path / 'results'
     answer = djet('evaluate', road, far, '--methods', 'djet,five_point', '--presets', 'best',
-                  '--output', output)
+                  '--workers', '1', '--output', output)
     assert answer.returncode == 0, answer.stderr
     found = {row['method']: row for row in rows(output / 'drift.csv')}
     # Both have the name of the scene, and the second one gets a suffix.
@@ -319,7 +319,7 @@ def test_no_method_has_features_where_the_lens_shows_nothing(road, tmp_path):
 def test_a_bag_gives_the_errors_of_the_folder_that_it_was_made_of(road, tmp_path):
     write_kitti_bag(KittiSequence(road, end=4), tmp_path / 'bag')
     answer = djet('evaluate', tmp_path / 'bag', road, '--end', '4', '--methods', 'djet',
-                  '--presets', 'best', '--output', tmp_path / 'results')
+                  '--presets', 'best', '--workers', '1', '--output', tmp_path / 'results')
     assert answer.returncode == 0, answer.stderr
     bag, folder = rows(tmp_path / 'results' / 'table1.csv')
     assert (bag['sequence'], folder['sequence']) == ('bag', 'road')
@@ -490,7 +490,8 @@ def test_ctrl_c_in_a_terminal_ends_all_processes_at_once_in_one_line(verb, momen
 
 
 def test_results_of_other_settings_are_not_mixed(road, tmp_path):
-    run = ('evaluate', road, '--end', '3', '--presets', 'best', '--output', tmp_path)
+    run = ('evaluate', road, '--end', '3', '--presets', 'best', '--workers', '1', '--output',
+           tmp_path)
     assert djet(*run, '--methods', 'djet').returncode == 0
     before = (tmp_path / 'records.jsonl').read_bytes()
     answer = djet(*run, '--methods', 'rpe')
@@ -518,7 +519,7 @@ def test_results_of_other_code_or_libraries_are_not_mixed(other, tmp_path):
 
 def test_a_damaged_store_is_named(road, tmp_path):
     run = ('evaluate', road, '--end', '3', '--presets', 'best', '--methods', 'five_point',
-           '--output', tmp_path)
+           '--workers', '1', '--output', tmp_path)
     assert djet(*run).returncode == 0
     with (tmp_path / 'records.jsonl').open('a') as store:
         store.write('nonsense\n')
@@ -609,8 +610,9 @@ def test_evo_finds_no_error_in_the_ground_truth(evaluated):
 # Ablation
 
 def test_an_ablation_has_a_row_for_each_change(road, tmp_path):
-    answer = djet('ablate', road, '--end', '4', '--output', tmp_path, '--windows', '3,5',
-                  '--parts', 'window,recentring,starts', '--presets', 'best,paper')
+    answer = djet('ablate', road, '--end', '4', '--workers', '1', '--output', tmp_path,
+                  '--windows', '3,5', '--parts', 'window,recentring,starts', '--presets',
+                  'best,paper')
     assert answer.returncode == 0, answer.stderr
     found = [(row['preset'], row['method'], row['change'])
              for row in rows(tmp_path / 'ablation.csv')]

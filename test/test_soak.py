@@ -11,6 +11,7 @@ import subprocess
 import sys
 from typing import Any
 
+from commands import djet
 from covariances import check_messages
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator_config import EstimatorConfig
@@ -103,7 +104,7 @@ def test_user_errors_are_one_line_and_exit_code_2(
     output = tmp_path / 'soak.json'
     if not arguments:
         output.write_text('{}')
-    run = djet_soak('--output', output, *arguments)
+    run = djet('lab', 'soak', '--output', output, *arguments)
     assert run.returncode == 2
     assert message in run.stderr
     assert run.stderr.count('\n') == 1
