@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.metadata import Distribution, distributions, version
 from pathlib import Path
 import re
@@ -36,6 +36,19 @@ def run(*command: str | Path, cwd: Path) -> str:
                           capture_output=True, check=False)
     assert done.returncode == 0, f'{command}\n{done.stdout}\n{done.stderr}'
     return done.stdout
+
+
+@pytest.fixture(scope='module', autouse=True)
+def unoptimised(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Compile without optimisation, which would take most of the time of each build."""
+    with pytest.MonkeyPatch.context() as patch:
+        if compiler := shutil.which('cc'):
+            script = tmp_path_factory.mktemp('compiler') / 'cc'
+            # The last level counts.
+            script.write_text(f'#!/bin/sh\nexec {compiler} "$@" -O0\n')
+            script.chmod(0o755)
+            patch.setenv('CC', str(script))
+        yield
 
 
 @pytest.fixture(scope='module')
