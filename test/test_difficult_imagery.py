@@ -8,7 +8,7 @@ may occur and, where a motion is estimated, bounds on its median errors. Each is
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -101,15 +101,21 @@ def large() -> Iterator[Outcome]:
     return outcomes_of([image, image])
 
 
+@cache
+def rendered(scene_name: str) -> tuple[NDArray[np.float64], NDArray[np.float64], list[Gray]]:
+    """Camera matrix, poses and images of a scene, which several kinds change."""
+    scene = make_scene(scene_name, size=SIZE)
+    poses = scene.trajectory(FRAMES)
+    return scene.K, poses, [scene.render(pose, i) for i, pose in enumerate(poses)]
+
+
 def drive(scene_name: str, change: Callable[[int, Gray], Gray] = lambda i, gray: gray,
           keep: Callable[[int], bool] = lambda i: True, **estimator: object) -> Iterator[Outcome]:
     """Outcomes of a rendered drive, each pair against the truth between its two frames."""
-    scene = make_scene(scene_name, size=SIZE)
-    poses = scene.trajectory(FRAMES)
+    K, poses, images = rendered(scene_name)
     odometry = VisualOdometry(preset('best', **estimator))
     for i in filter(keep, range(FRAMES)):
-        image = change(i, scene.render(poses[i], i))
-        result = odometry.process(Frame(image, scene.K, (i + 1) * PERIOD_NS))
+        result = odometry.process(Frame(change(i, images[i]), K, (i + 1) * PERIOD_NS))
         check_messages(result)
         if result.previous_stamp_ns is None:
             continue

@@ -171,9 +171,10 @@ def test_at_the_start_a_camera_moves_without_rotation_if_no_feature_is_static() 
 
 def test_a_lorry_that_hides_everything_does_not_move_a_stationary_camera() -> None:
     seen = set()
-    for seed in (70, 71, 73):
+    # in the first it hides everything in the middle, in the others from the start
+    for seed, frames in ((70, 16), (71, 8), (73, 8)):
         scene = make_scene('traffic', seed, (620, 188))
-        results = gone(scene, scene.trajectory(16), seed, first=22)
+        results = gone(scene, scene.trajectory(frames), seed, first=22)
         assert all(result.stationary for result in results if result.status in TRACKED)
         seen |= {result.status for result in results}
     # In some image nothing was left to stand still for.

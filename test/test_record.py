@@ -21,14 +21,18 @@ LIVE = shlex.join([sys.executable, '-c', 'from djet_ros.cli.main import main; '
                    'raise SystemExit(main())', 'live'])
 
 
+@pytest.fixture(scope='module')
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return render_sequence('road', tmp_path_factory.mktemp('street'), 30, size=(320, 240))
+
+
 @pytest.fixture
-def place(tmp_path: Path) -> Path:
+def place(street: Path, tmp_path: Path) -> Path:
     """Return a folder with the script, its figures, and a rendered street as KITTI 06."""
     for name in ('record.py', 'recorded.yaml'):
         shutil.copy(DOC / name, tmp_path)
     (tmp_path / 'kitti' / 'sequences').mkdir(parents=True)
-    street = render_sequence('road', tmp_path / 'street', 30, size=(320, 240))
-    shutil.move(street, tmp_path / 'kitti' / 'sequences' / '06')
+    shutil.copytree(street, tmp_path / 'kitti' / 'sequences' / '06')
     return tmp_path
 
 

@@ -53,11 +53,13 @@ def test_memory_and_latency_are_recorded_and_memory_does_not_grow(tmp_path: Path
     assert output.with_suffix('.png').read_bytes().startswith(b'\x89PNG')
 
 
-def test_no_covariance_of_a_soak_is_zero_infinite_or_absurd() -> None:
+def test_no_covariance_of_a_soak_is_zero_infinite_or_absurd(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    # With all that happens in a soak: darkness, a gap, and stamps that step back, here sooner.
+    monkeypatch.setattr(module, '_BACK', 230)
     odometry = VisualOdometry(EstimatorConfig(max_features=module.FEATURES), OdometryConfig())
     statuses = set()
-    # Beyond the first step back of the stamps.
-    for frame in module._drive(500):
+    for frame in module._drive(250):
         result = odometry.process(frame)
         statuses.add(result.status)
         check_messages(result)
