@@ -10,6 +10,7 @@ from time import perf_counter
 from djet_ros.core.algorithm import evaluate_at, Track
 from djet_ros.core.basins import BASIN_TUNING
 from djet_ros.core.corners import detect_corners, detect_large_corners
+from djet_ros.core.covariance import CHI2_999, pose_difference, squared_distance
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.features import detect_orb
 from djet_ros.core.fusion import agrees
@@ -131,23 +132,25 @@ class TwoViewEstimator:
             x, y = match_widely(previous, current, prior, known, self.config.search_radius)
         pair = Pair(previous, current, x, y, _prior_pose(prior), known,
                     sought=len(previous.features.with_additional), timings=timings)
+        result = self.estimate_pair(pair)
         # If another body moved in the previous pair, go on with the one that it followed: by now
         # most matches may be of the other one, or fit a compromise.
         followed = None if prior is None else self._estimate_followed(pair, prior)
-        return self.estimate_pair(pair) if followed is None else followed
+        return result if followed is None or _is_same(followed, result) else followed
 
     def _estimate_followed(self, pair: Pair, prior: RelativePose) -> RelativePose | None:
         """
         Estimate the motion of the body that the previous pair followed, from its matches alone.
 
-        None if no other body moved, or if the matches do not fit one motion as before.
+        None if there are hardly any others, or if they do not fit one motion as before: also if
+        some of them turn out to be attached to the camera.
         """
         followed = of_followed_body(prior, pair.x)
         if (~followed).sum() <= MIN_BODY_SHARE * len(followed):
             return None
         result = self.estimate_pair(pair.without(~followed))
-        within = _within_limits(result, _limits_from(prior))
-        return with_left_out(result, pair, followed) if within else None
+        fit = len(result.x) == followed.sum() and _within_limits(result, _limits_from(prior))
+        return with_left_out(result, pair, followed) if fit else None
 
     def match(self, previous: View, current: View) -> Matches:
         """Match the features of two views: pixels x and y (N, 2), the most reliable first."""
@@ -312,6 +315,17 @@ def _within_limits(result: RelativePose, limits: Limits) -> bool:
     return (result.status in (Status.OK, Status.NO_PARALLAX)
             and robust_scale(result.residuals) < limits.max_noise
             and result.inliers.mean() > limits.min_agreeing)
+
+
+def _is_same(one: RelativePose, other: RelativePose) -> bool:
+    """
+    Return whether two estimates are one motion, within the covariance of the first.
+
+    If nothing else moves, matches are left out where the previous motion was inaccurate; they
+    should be in the estimate.
+    """
+    offset = pose_difference(one.R, one.t, Pose(other.R, other.t))
+    return squared_distance(one.own_covariance_5, offset) < CHI2_999
 
 
 def _prior_pose(prior: RelativePose | None) -> Pose | None:
