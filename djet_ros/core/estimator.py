@@ -143,14 +143,15 @@ class TwoViewEstimator:
         Estimate the motion of the body that the previous pair followed, from its matches alone.
 
         None if there are hardly any others, or if they do not fit one motion as before: also if
-        some of them turn out to be attached to the camera.
+        that is a rotation alone, or if some of them turn out to be attached to the camera.
         """
         followed = of_followed_body(prior, pair.x)
         if (~followed).sum() <= MIN_BODY_SHARE * len(followed):
             return None
         result = self.estimate_pair(pair.without(~followed))
-        fit = len(result.x) == followed.sum() and _within_limits(result, _limits_from(prior))
-        return with_left_out(result, pair, followed) if fit else None
+        found = (result.t.any() and len(result.x) == followed.sum()
+                 and _within_limits(result, _limits_from(prior)))
+        return with_left_out(result, pair, followed) if found else None
 
     def match(self, previous: View, current: View) -> Matches:
         """Match the features of two views: pixels x and y (N, 2), the most reliable first."""
