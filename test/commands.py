@@ -30,6 +30,13 @@ def redirected(descriptor: int) -> Iterator[BinaryIO]:
             os.close(kept)
 
 
+def checked(*words: object, expect: int = 0) -> CompletedProcess[str]:
+    """Run a command that has to end with an exit code."""
+    done = djet(*words)
+    assert done.returncode == expect, done.stderr
+    return done
+
+
 def djet(*words: object, encoding: str = 'utf-8') -> CompletedProcess[str]:
     """
     Run a command to its end, and return what a process with such a stdout would.

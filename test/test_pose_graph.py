@@ -5,7 +5,7 @@ from dataclasses import replace
 import shutil
 
 from cards import Cards, K, pose, SIZE
-import commands
+from commands import checked as djet
 from conftest import write_small_kitti
 from djet_ros.config.flat import from_flat
 from djet_ros.config.sections import Config
@@ -28,12 +28,6 @@ from scipy.spatial.transform import Rotation
 
 FRAMES = 5
 STEP = pose(x=0.25, z=0.15, yaw=0.01)
-
-
-def djet(*arguments, expect=0):
-    done = commands.djet(*arguments)
-    assert done.returncode == expect, done.stderr
-    return done
 
 
 class Drive:

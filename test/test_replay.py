@@ -12,7 +12,7 @@ import sys
 import time
 
 from cards import Cards, DEPTHS, K, pose, SIZE
-import commands
+from commands import checked as djet
 import cv2
 from djet_ros.config.flat import from_flat
 from djet_ros.config.sections import Config
@@ -45,12 +45,6 @@ DJET = [sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; s
 FRAMES = 6
 STEP = pose(x=0.25, z=0.15, yaw=0.01)
 SECOND = 10**9
-
-
-def djet(*call, expect=0):
-    done = commands.djet(*call)
-    assert done.returncode == expect, done.stderr
-    return done
 
 
 def djet_alone(*call, **settings):

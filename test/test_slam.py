@@ -7,7 +7,7 @@ import shutil
 import tracemalloc
 
 from cards import Cards, K, pose
-import commands
+from commands import checked as djet
 import cv2
 from djet_ros.config.sections import Config, SlamConfig
 from djet_ros.core.estimator import TwoViewEstimator
@@ -31,12 +31,6 @@ import numpy as np
 import pytest
 
 SIGMAS = np.array([0.01, 0.01, 0.01, 1e-3, 1e-3, 1e-3])
-
-
-def djet(*arguments, expect=0):
-    done = commands.djet(*arguments)
-    assert done.returncode == expect, done.stderr
-    return done
 
 
 def twice_round(frames=60, laps=2):

@@ -268,6 +268,11 @@ def squared_distance(covariance: Array, offset: Array) -> float:
     return float(((axes.T @ offset)**2 / np.maximum(variances, _MIN_VARIANCE)).sum())
 
 
+def is_within(covariance: Array, offset: Array) -> bool:
+    """Return whether a difference of poses (5,) is within the 99.9 % ellipsoid."""
+    return squared_distance(covariance, offset) < CHI2_999
+
+
 def widened_to_span(covariance: Array, offset: Array, probability: float) -> Array:
     """
     Widen a covariance (5, 5) by a rival at an offset (5,) that is true with a probability.

@@ -10,7 +10,7 @@ from time import perf_counter
 from djet_ros.core.algorithm import evaluate_at, Track
 from djet_ros.core.basins import BASIN_TUNING
 from djet_ros.core.corners import detect_corners, detect_large_corners
-from djet_ros.core.covariance import CHI2_999, pose_difference, squared_distance
+from djet_ros.core.covariance import is_within, pose_difference
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.features import detect_orb
 from djet_ros.core.fusion import agrees
@@ -325,8 +325,8 @@ def _is_same(one: RelativePose, other: RelativePose) -> bool:
     If nothing else moves, matches are left out where the previous motion was inaccurate; they
     should be in the estimate.
     """
-    offset = pose_difference(one.R, one.t, Pose(other.R, other.t))
-    return squared_distance(one.own_covariance_5, offset) < CHI2_999
+    return is_within(one.own_covariance_5,
+                     pose_difference(one.R, one.t, Pose(other.R, other.t)))
 
 
 def _prior_pose(prior: RelativePose | None) -> Pose | None:

@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 from djet_ros.core.algorithm import ALGORITHM_TUNING, Track
 from djet_ros.core.covariance import (
     calibration_covariance,
-    CHI2_999,
+    is_within,
     lifted_covariance,
     pose_covariance,
     pose_difference,
-    squared_distance,
     UNDETERMINED,
     widened,
     widened_by_profile,
@@ -232,7 +231,7 @@ def _compare_with_rivals(pose: Pose, covariance: Array, track: Track, x: Array,
     possible: list[Pose] = []
     for rival in (*track.rivals, *track.nearby):
         offset = pose_difference(pose.R, pose.t, rival.pose)
-        if squared_distance(covariance, offset) < CHI2_999:
+        if is_within(covariance, offset):
             continue
         undecided = (rival.preference < SIGNIFICANT_PREFERENCE
                      and not _prior_decides(prior, pose, rival.pose))

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Array
 from djet_ros.lab.scenes import street_textures as paint
 from djet_ros.lab.scenes.panel import Panel, tiled
+from djet_ros.lab.scenes.route import pose_at
 from djet_ros.lab.scenes.texture import fractal, Gray, make_texture, Texture
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -68,11 +68,7 @@ class Flight:
     def pose(self, index: int) -> Array:
         """Pose (4, 4), camera to level axes."""
         yaw, pitch, roll = self._angles[index]
-        pose = np.eye(4)
-        pose[:3, :3] = rotation_exp(np.array([0, yaw, 0])) @ rotation_exp(
-            np.array([pitch - self.tilt, 0, 0])) @ rotation_exp(np.array([0, 0, roll]))
-        pose[:3, 3] = self._places[index]
-        return pose
+        return pose_at(self._places[index], yaw, pitch - self.tilt, roll)
 
     @cached_property
     def _angles(self) -> Array:
@@ -87,8 +83,9 @@ class Flight:
     def _places(self) -> Array:
         """Places (limit, 3) in level axes."""
         horizontal = np.cumsum(self._smooth(2) * self.speed / np.sqrt(2), axis=0)[:, :2]
-        climb = 0.2 * self.height * np.tanh(
-            np.cumsum(self._smooth(3)[:, 0]) * self.speed / (2.5 * 0.2 * self.height))
+        # It keeps within a fifth of its height.
+        most = 0.2 * self.height
+        climb = most * np.tanh(np.cumsum(self._smooth(3)[:, 0]) * self.speed / (2.5 * most))
         return np.column_stack([horizontal[:, 0], -self.height - climb, horizontal[:, 1]])
 
     def _smooth(self, number: int) -> Array:

@@ -10,6 +10,7 @@ from djet_ros.core.types import Array
 from djet_ros.lab.scenes import street_objects as things, street_textures as paint
 from djet_ros.lab.scenes.panel import fitted, Mover, Panel, placed, tiled
 from djet_ros.lab.scenes.route import level_pose, Route
+from djet_ros.lab.scenes.street import along, country, strip
 from djet_ros.lab.scenes.texture import fractal, make_texture, Texture
 import numpy as np
 
@@ -18,7 +19,8 @@ import numpy as np
 OWN_LANE = 5.0
 _SLOW_LANE, _ONCOMING_LANE = 8.75, -5.0
 
-_RAILS = (-12.5, -1.6, 1.6, 12.5)
+# Metres of guard rails from the middle, and of the length of a straight piece of road.
+_RAILS = (1.6, 12.5)
 _PIECE = 8.0
 
 
@@ -26,54 +28,24 @@ def motorway(route: Route, rng: np.random.Generator) -> tuple[Panel, ...]:
     """Panels of a motorway along the whole route."""
     palette = things.make_palette(rng, True)
     asphalt, rail, sign = _asphalt(rng), _rail(rng), paint.lettering(rng, 3)
-    panels = [*_country(route, palette), *_roadway(route, asphalt)]
-    for offset in _RAILS:
-        panels += _along(route, np.full(2000, 4.0), offset, lambda: [
-            tiled((0, -0.8, -2), (0, 0, 4), (0, 0.8, 0), rail)])
+    panels = [*country(route, palette, 3), *_roadway(route, asphalt)]
     for side in (-1, 1):
-        panels += _along(route, rng.uniform(25, 90, 200), side * 30,
-                         partial(_copse, palette, rng))
-        panels += _along(route, rng.uniform(60, 61, 200), side * 75, lambda: [
+        for offset in _RAILS:
+            panels += along(route, side, np.full(2000, 4.0), offset, lambda: [
+                tiled((0, -0.8, -2), (0, 0, 4), (0, 0.8, 0), rail)])
+        panels += along(route, side, rng.uniform(25, 90, 200), 30.0,
+                        partial(_copse, palette, rng))
+        panels += along(route, side, rng.uniform(60, 61, 200), 75.0, lambda: [
             tiled((0, -12, -30), (0, 0, 60), (0, 12, 0), palette.treeline)])
-        panels += _along(route, rng.uniform(150, 300, 40), side * 14,
-                         partial(_signpost, sign, palette.metal))
+        panels += along(route, side, rng.uniform(150, 300, 40), 14.0,
+                        partial(_signpost, sign, palette.metal))
     return tuple(panels)
 
 
-def _country(route: Route, palette: things.Palette) -> list[Panel]:
-    """Ground in squares of 64 m, and a sky."""
-    size = 64.0
-    cells = np.unique(np.round(route.points[::100] / size).astype(int), axis=0)
-    reach = np.stack(np.meshgrid(np.arange(-3, 4), np.arange(-3, 4)), axis=-1).reshape(-1, 2)
-    cells = np.unique((cells[:, None] + reach).reshape(-1, 2), axis=0)
-    low, high = route.points.min(0) - 6000, route.points.max(0) + 6000
-    return [*(tiled((x * size, 0, z * size), (size, 0, 0), (0, 0, size), palette.ground)
-              for x, z in cells),
-            tiled((low[0], -500, low[1]), (high[0] - low[0], 0, 0), (0, 0, high[1] - low[1]),
-                  palette.sky)]
-
-
 def _roadway(route: Route, asphalt: Texture) -> list[Panel]:
-    """Both carriageways in straight pieces; overlaps are settled by layers."""
-    panels = []
-    for number, s in enumerate(np.arange(0, route.length - _PIECE, _PIECE)):
-        points, _ = route.at(np.array([s, s + _PIECE]))
-        along = (points[1] - points[0]) * 1.02
-        right = np.array([along[1], -along[0]]) / np.linalg.norm(along) * asphalt.metres[0]
-        corner = points[0] - right / 2
-        panels.append(tiled((corner[0], 0, corner[1]), (right[0], 0, right[1]),
-                            (along[0], 0, along[1]), asphalt, start=(0.0, s),
-                            layer=1 + number % 5))
-    return panels
-
-
-def _along(route: Route, gaps: Array, offset: float, make: Callable[[], list[Panel]]
-           ) -> list[Panel]:
-    """Things ``offset`` metres to the right of the route, ``gaps`` (N,) apart."""
-    stations = np.cumsum(gaps)
-    points, headings = route.at(stations[stations < route.length], offset)
-    return [panel for point, heading in zip(points, headings)
-            for panel in placed(make(), level_pose(point[0], point[1], heading))]
+    """Both carriageways in straight pieces."""
+    return [strip(route, s, _PIECE, 1.02, asphalt, 1 + number % 5)
+            for number, s in enumerate(np.arange(0, route.length - _PIECE, _PIECE).tolist())]
 
 
 def _copse(palette: things.Palette, rng: np.random.Generator) -> list[Panel]:

@@ -85,6 +85,16 @@ def level_pose(x: float, z: float, heading: float, height: float = 0.0) -> Array
     return pose
 
 
+def pose_at(place: Sequence[float] | Array, yaw: float, pitch: float, roll: float) -> Array:
+    """Pose (4, 4) at a place (3,), turned by yaw, pitch and roll in radians in that order."""
+    pose = np.eye(4)
+    pose[:3, :3] = (rotation_exp(np.array([0.0, yaw, 0.0]))
+                    @ rotation_exp(np.array([pitch, 0.0, 0.0]))
+                    @ rotation_exp(np.array([0.0, 0.0, roll])))
+    pose[:3, 3] = place
+    return pose
+
+
 class Trajectory(Protocol):
     """Camera poses in level axes, frame by frame."""
 

@@ -8,6 +8,7 @@ from djet_ros.core.types import Array
 from djet_ros.lab.scenes import street_objects as things, street_textures as paint
 from djet_ros.lab.scenes.panel import Panel, placed, tiled
 from djet_ros.lab.scenes.route import level_pose, Route
+from djet_ros.lab.scenes.texture import Texture
 import numpy as np
 
 # How near a house may come to the middle of the road.
@@ -17,17 +18,17 @@ _CLEARANCE = 7.3
 def street(route: Route, palette: things.Palette,
            rng: np.random.Generator) -> tuple[Panel, ...]:
     """Panels of a street along the whole route; trees and cars only where it is varied."""
-    panels = [*_earth(route, palette), *_surface(route, palette)]
+    panels = [*country(route, palette, 4), *_horizon(route, palette), *_surface(route, palette)]
     for side in (-1, 1):
         panels += _houses(route, rng, palette, side)
-        panels += _along(route, side, _gaps(rng, 28, 28), 5.4, lambda: things.lamp(palette))
+        panels += along(route, side, _gaps(rng, 28, 28), 5.4, lambda: things.lamp(palette))
         if not palette.varied:
-            panels += _along(route, side, _gaps(rng, 6, 6), 7.3, lambda: things.fence(palette))
+            panels += along(route, side, _gaps(rng, 6, 6), 7.3, lambda: things.fence(palette))
             continue
-        panels += _along(route, side, _gaps(rng, 6, 6), 7.3, lambda: things.border(rng, palette))
-        panels += _along(route, side, _gaps(rng, 7, 15), 6.1, lambda: things.tree(rng, palette))
-        panels += _along(route, side, _gaps(rng, 5.2, 16), 4.05,
-                         lambda: things.car(rng, palette))
+        panels += along(route, side, _gaps(rng, 6, 6), 7.3, lambda: things.border(rng, palette))
+        panels += along(route, side, _gaps(rng, 7, 15), 6.1, lambda: things.tree(rng, palette))
+        panels += along(route, side, _gaps(rng, 5.2, 16), 4.05,
+                        lambda: things.car(rng, palette))
     return tuple(panels)
 
 
@@ -36,23 +37,25 @@ def _gaps(rng: np.random.Generator, least: float, most: float) -> Array:
     return rng.uniform(least, most, 1000)
 
 
-def _earth(route: Route, palette: things.Palette) -> list[Panel]:
-    """Ground in squares of 64 m, a sky, and rows of trees that close the view."""
+def country(route: Route, palette: things.Palette, reach: int) -> list[Panel]:
+    """Ground in squares of 64 m, ``reach`` of them to each side of the route, and a sky."""
     size = 64.0
     cells = np.unique(np.round(route.points[::100] / size).astype(int), axis=0)
-    reach = np.stack(np.meshgrid(np.arange(-4, 5), np.arange(-4, 5)), axis=-1).reshape(-1, 2)
-    cells = np.unique((cells[:, None] + reach).reshape(-1, 2), axis=0)
+    steps = np.arange(-reach, reach + 1)
+    around = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    cells = np.unique((cells[:, None] + around).reshape(-1, 2), axis=0)
     panels = [tiled((x * size, 0, z * size), (size, 0, 0), (0, 0, size), palette.ground)
               for x, z in cells]
     low, high = route.points.min(0), route.points.max(0)
     corner, extent = low - 6000, high - low + 12000
     panels.append(tiled((corner[0], -500, corner[1]), (extent[0], 0, 0), (0, 0, extent[1]),
                         palette.sky))
-    return panels + _horizon(low - 70, high + 70, palette)
+    return panels
 
 
-def _horizon(low: Array, high: Array, palette: things.Palette) -> list[Panel]:
-    """Trees on the four sides of the box from ``low`` to ``high`` in the ground plane."""
+def _horizon(route: Route, palette: things.Palette) -> list[Panel]:
+    """Rows of trees 70 m around the route, which close the view."""
+    low, high = route.points.min(0) - 70, route.points.max(0) + 70
     (x0, z0), (x1, z1) = low, high
     corners = [(x0, z0), (x1, z0), (x1, z1), (x0, z1)]
     return [tiled((x, -14, z), (x_next - x, 0, z_next - z), (0, 14, 0), palette.treeline)
@@ -66,21 +69,26 @@ def _surface(route: Route, palette: things.Palette) -> list[Panel]:
     while s < route.length - 0.5:
         curvature = abs(route.curvature[int(s / route.length * len(route.curvature))])
         length = min(1.0 if curvature > 0.02 else 4.0, route.length - s)
-        points, _ = route.at(np.array([s, s + length]))
-        along = points[1] - points[0]
-        along *= (1 + 0.4 * curvature * paint.ROAD_WIDTH)
-        right = np.array([along[1], -along[0]]) / np.linalg.norm(along) * paint.ROAD_WIDTH
-        corner = points[0] - right / 2
-        texture = palette.roads[int(s / 24) % len(palette.roads)]
-        panels.append(tiled((corner[0], 0, corner[1]), (right[0], 0, right[1]),
-                            (along[0], 0, along[1]), texture, start=(0.0, s),
-                            layer=1 + piece % 5))
+        panels.append(strip(route, s, length, 1 + 0.4 * curvature * paint.ROAD_WIDTH,
+                            palette.roads[int(s / 24) % len(palette.roads)], 1 + piece % 5))
         s, piece = s + length, piece + 1
     return panels
 
 
-def _along(route: Route, side: int, gaps: Array, offset: float,
-           make: Callable[[], list[Panel]]) -> list[Panel]:
+def strip(route: Route, s: float, length: float, stretch: float, texture: Texture,
+          layer: int) -> Panel:
+    """Straight piece of a road as wide as its texture, from arc length s; it may overlap."""
+    points, _ = route.at(np.array([s, s + length]))
+    along = points[1] - points[0]
+    along *= stretch
+    right = np.array([along[1], -along[0]]) / np.linalg.norm(along) * texture.metres[0]
+    corner = points[0] - right / 2
+    return tiled((corner[0], 0, corner[1]), (right[0], 0, right[1]), (along[0], 0, along[1]),
+                 texture, start=(0.0, s), layer=layer)
+
+
+def along(route: Route, side: int, gaps: Array, offset: float,
+          make: Callable[[], list[Panel]]) -> list[Panel]:
     """Things on one side of the route, ``gaps`` (N,) apart, where they keep clear of all of it."""
     stations = np.cumsum(gaps)
     points, headings = route.at(stations[stations < route.length], side * offset)

@@ -7,7 +7,7 @@ from functools import cached_property
 
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Array
-from djet_ros.lab.scenes.route import Drive, level_pose, Route
+from djet_ros.lab.scenes.route import Drive, level_pose, pose_at, Route
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -84,12 +84,8 @@ class HandHeld:
 
     def pose(self, index: int) -> Array:
         """Pose (4, 4), camera to level axes."""
-        pose = np.eye(4)
         pitch, yaw, roll = self._angles[index]
-        pose[:3, :3] = rotation_exp(yaw * _YAW) @ rotation_exp(
-            (pitch - self.tilt) * _PITCH) @ rotation_exp(roll * _ROLL)
-        pose[:3, 3] = self.place + self._offsets[index]
-        return pose
+        return pose_at(self.place + self._offsets[index], yaw, pitch - self.tilt, roll)
 
     def turning(self, index: int) -> Array:
         """Rotation vector (3,) in camera axes by which it turns per frame about this one."""
@@ -157,11 +153,8 @@ class Whip:
         steps = round(self.reach / self.turn)
         yaw = (abs((index + steps) % (4 * steps) - 2 * steps) - steps) * self.turn
         sway = np.sin(self._phases + index * np.array([0.37, 0.53, 0.29, 0.47, 0.31]))
-        pose = np.eye(4)
-        pose[:3, :3] = rotation_exp(-yaw * _YAW) @ rotation_exp(
-            (0.1 * sway[0] - self.tilt) * _PITCH) @ rotation_exp(0.08 * sway[1] * _ROLL)
-        pose[:3, 3] = self.place + sway[2:] * (0.12, 0.05, 0.1)
-        return pose
+        return pose_at(self.place + sway[2:] * (0.12, 0.05, 0.1), -yaw,
+                       0.1 * sway[0] - self.tilt, 0.08 * sway[1])
 
     @cached_property
     def _phases(self) -> Array:
