@@ -5,11 +5,14 @@ from typing import Any
 
 __version__ = '0.3.0'
 
-# What the motion between two images takes, and where it is; commands that need none of it are
-# quick, as it is imported where it is asked for.
-_LIBRARY = {'TwoViewEstimator': 'djet_ros.core.estimator',
+# What the motion between images takes, and where it is; commands that need none of it are quick,
+# as it is imported where it is asked for.
+_LIBRARY = {'Frame': 'djet_ros.odometry.frame',
+            'OdometryConfig': 'djet_ros.config.sections',
             'preset': 'djet_ros.core.estimator_config',
-            'Status': 'djet_ros.core.types'}
+            'Status': 'djet_ros.core.types',
+            'TwoViewEstimator': 'djet_ros.core.estimator',
+            'VisualOdometry': 'djet_ros.odometry.visual_odometry'}
 
 
 def __getattr__(name: str) -> Any:

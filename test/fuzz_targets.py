@@ -30,7 +30,7 @@ from djet_ros.odometry.messages import pose_of
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.recordings.bag_writers import ResultBag, write_kitti_bag
 from djet_ros.recordings.bags import Bag
-from djet_ros.recordings.datasets import euroc, seven_scenes, tum_rgbd
+from djet_ros.recordings.datasets import euroc, plain_images, seven_scenes, tum_rgbd
 from djet_ros.recordings.decoding import decoder, jazzy, message_type
 from djet_ros.recordings.frame_sequence import FrameSequence
 from djet_ros.recordings.kitti import KittiSequence, read_camera, read_poses
@@ -449,6 +449,17 @@ def tum_folder(place: Path) -> None:
         f'1305031102.{i}5 {i} 0.5 -1e-2 0 0.6 0 0.8\n' for i in range(5)))
 
 
+def plain_folder(place: Path) -> None:
+    for i in range(FRAMES):
+        (place / f'{i}.png').write_bytes(PNG)
+    (place / 'calibration.yaml').write_text(
+        'image_width: 24\nimage_height: 20\n'
+        'camera_matrix: {rows: 3, cols: 3, data: [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]}\n'
+        'distortion_model: plumb_bob\n'
+        'distortion_coefficients: {rows: 1, cols: 5, data: [0.1, -0.02, 0, 0, 0]}\n')
+    (place / 'times.txt').write_text(''.join(f'0.{i}\n' for i in range(FRAMES)))
+
+
 SENSOR = """# General sensor definitions.
 sensor_type: camera
 T_BS:
@@ -663,6 +674,8 @@ TARGETS: dict[str, Target] = {
     'tum_list': sequence_target(tum_folder, 'rgb.txt', tum_rgbd),
     'tum_camera': sequence_target(tum_folder, 'calibration.txt', tum_rgbd),
     'tum_truth': sequence_target(tum_folder, 'groundtruth.txt', tum_rgbd),
+    'plain_camera': sequence_target(plain_folder, 'calibration.yaml', plain_images),
+    'plain_times': sequence_target(plain_folder, 'times.txt', plain_images),
     'euroc_list': sequence_target(euroc_folder, 'mav0/cam0/data.csv', euroc),
     'euroc_camera': sequence_target(euroc_folder, 'mav0/cam0/sensor.yaml', euroc),
     'euroc_truth': sequence_target(

@@ -4,8 +4,10 @@ from pathlib import Path
 import re
 import shutil
 
+from commands import checked
 import cv2
 from djet_ros.errors import DjetError
+from djet_ros.lab.scenes.sequence import render_sequence
 from djet_ros.odometry.messages import stamp_ns
 from djet_ros.recordings.bag_writers import write_kitti_bag
 from djet_ros.recordings.bags import Bag
@@ -230,6 +232,117 @@ def test_a_pose_of_7_scenes_that_is_none_is_named(tmp_path: Path) -> None:
     (folder / 'frame-000001.pose.txt').write_text('1 0 0 0\n')
     with pytest.raises(DjetError, match='has 1 rows; a pose must have 4'):
         seven_scenes(folder)
+
+
+# Images of one's own
+
+ROS_CALIBRATION = """\
+image_width: 160
+image_height: 120
+camera_name: narrow_stereo
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [100.5, 0, 80, 0, 101, 60, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [0.1, -0.2, 0.001, 0.002, 0]
+rectification_matrix:
+  rows: 3
+  cols: 3
+  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [98, 0, 80, 0, 0, 98, 60, 0, 0, 0, 1, 0]
+"""
+
+
+@pytest.fixture
+def images(tmp_path: Path) -> Path:
+    """Return a folder of twelve images, each brighter than the one before."""
+    folder = tmp_path / 'my_images'
+    folder.mkdir()
+    for i in range(12):
+        cv2.imwrite(str(folder / f'frame{i}.{"png" if i % 2 else "JPG"}'),
+                    np.full(SIZE[::-1], 10 * i, np.uint8))
+    (folder / 'calibration.yaml').write_text(ROS_CALIBRATION)
+    return folder
+
+
+def test_own_images_are_in_the_order_of_their_numbers_with_the_camera_of_ros(images: Path) -> None:
+    sequence = open_sequence(images)
+    assert [round(sequence.image(i).mean() / 10) for i in range(12)] == list(range(12))
+    assert sequence.K.tolist() == [[100.5, 0, 80], [0, 101, 60], [0, 0, 1]]
+    assert sequence.distortion.tolist() == [0.1, -0.2, 0.001, 0.002, 0]
+    assert (sequence.name, sequence.poses) == ('my_images', None)
+    assert np.diff(sequence.stamps_ns).tolist() == [33_333_333] * 11
+    (images / 'times.txt').write_text(''.join(f'{0.1 * i:.3f}\n' for i in range(12)))
+    assert np.diff(open_sequence(images).stamps_ns).tolist() == [100_000_000] * 11
+
+
+def test_a_calibration_by_opencv_and_one_of_many_coefficients_are_read(images: Path) -> None:
+    file = cv2.FileStorage(str(images / 'calibration.yaml'), cv2.FILE_STORAGE_WRITE)
+    for name, value in zip(('image_width', 'image_height'), SIZE):
+        file.write(name, value)
+    file.write('camera_matrix', np.array([[100, 0, 80], [0, 101, 60], [0, 0, 1.0]]))
+    file.write('distortion_coefficients', np.array([[0.1], [0.2], [0], [0], [0.3]]))
+    file.release()
+    assert open_sequence(images).distortion.tolist() == [0.1, 0.2, 0, 0, 0.3]
+    rational = ROS_CALIBRATION.replace('plumb_bob', 'rational_polynomial').replace(
+        '0.002, 0]', '0.002, 0, 0.3, 0.1, 0]').replace('cols: 5', 'cols: 8')
+    (images / 'calibration.yaml').write_text(rational)
+    sequence = open_sequence(images)
+    assert sequence.model == 'rational_polynomial'
+    assert sequence.distortion.tolist() == [0.1, -0.2, 0.001, 0.002, 0, 0.3, 0.1, 0]
+    assert sequence.image(3).shape == SIZE[::-1]
+
+
+def test_the_four_numbers_of_a_camera_suffice(images: Path) -> None:
+    (images / 'calibration.yaml').unlink()
+    (images / 'calibration.txt').write_text('100 101 80 60\n')
+    assert open_sequence(images).K.tolist() == [[100, 0, 80], [0, 101, 60], [0, 0, 1]]
+
+
+def test_own_images_give_the_same_trajectory_as_in_another_layout(tmp_path: Path) -> None:
+    original = render_sequence('road', tmp_path / 'rendered', 4, size=(310, 94))
+    K = open_sequence(original).K
+    folder = tmp_path / 'mine'
+    shutil.copytree(original / 'image_0', folder)
+    shutil.copy(original / 'times.txt', folder)
+    (folder / 'calibration.txt').write_text(f'{K[0, 0]} {K[1, 1]} {K[0, 2]} {K[1, 2]}')
+    for source in (original, folder):
+        checked('replay', source, '--output', tmp_path / f'results_{source.name}')
+    one, other = ((tmp_path / f'results_{source.name}' / 'trajectory_tum.txt').read_text()
+                  for source in (original, folder))
+    assert len(one.splitlines()) == 4 and one == other
+
+
+@pytest.mark.parametrize(('file', 'old', 'new', 'reason'), [
+    ('calibration.yaml', 'image_width: 160', 'image_width: 320',
+     'calibration.yaml is of 320x120 pixels, the images have 160x120; calibrate at this size'),
+    ('calibration.yaml', 'camera_matrix', 'camera_matrices', 'is no calibration of ROS'),
+    ('calibration.yaml', '100.5, 0, 80', '100.5, 2, 80', 'camera_matrix is .*; it must be fx 0'),
+    ('calibration.yaml', '100.5, 0, 80', '0, 0, 80', 'focal lengths must be positive'),
+    ('calibration.yaml', 'plumb_bob', 'equidistant', "'equidistant' with 5 numbers is not known"),
+    ('calibration.yaml', 'plumb_bob', 'ftheta', "'ftheta' with 5 numbers is not known"),
+    ('calibration.txt', '', '1 2 3 4', 'has calibration.txt and calibration.yaml; remove'),
+    ('times.txt', '', '0.0\n0.1\n', 'times.txt has 2 lines for 12 images'),
+])
+def test_a_wrong_file_beside_own_images_is_named(images: Path, file: str, old: str, new: str,
+                                                 reason: str) -> None:
+    before = (images / file).read_text() if (images / file).exists() else ''
+    (images / file).write_text(before.replace(old, new) if old else new)
+    with pytest.raises(DjetError, match=reason):
+        open_sequence(images)
+
+
+def test_images_without_a_calibration_are_told_what_they_need(images: Path) -> None:
+    (images / 'calibration.yaml').unlink()
+    with pytest.raises(DjetError, match=r'or images with calibration.yaml or calibration.txt'):
+        open_sequence(images)
 
 
 # KITTI raw

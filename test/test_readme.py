@@ -51,12 +51,24 @@ def test_the_readme_is_short():
     assert len((ROOT / 'README.md').read_bytes()) <= 8000
 
 
-def test_the_python_example_of_the_readme_estimates_the_motion_between_two_images(capsys):
-    code, = re.findall(r'```python\n(.*?)```', (ROOT / 'README.md').read_text(), re.DOTALL)
+def examples(page):
+    return re.findall(r'```python\n(.*?)```', (ROOT / page).read_text(), re.DOTALL)
+
+
+@pytest.fixture(scope='module')
+def road():
+    """Return images of a street for the examples, and true poses (3, 4, 4)."""
     scene = make_scene('road', 0, (620, 188))
-    poses = scene.trajectory(2)
-    names = {'K': scene.K, 'one': scene.render(poses[0], 0), 'other': scene.render(poses[1], 1)}
-    exec(code, names)
+    poses = scene.trajectory(3)
+    images = [scene.render(pose, index) for index, pose in enumerate(poses)]
+    return {'K': scene.K, 'one': images[0], 'other': images[1],
+            'images': [(10**9 + 10**8 * i, image) for i, image in enumerate(images)]}, poses
+
+
+def test_the_example_of_a_pair_estimates_the_motion_between_two_images(road, capsys):
+    names, poses = road
+    names = dict(names)
+    exec(examples('doc/without-ros.md')[0], names)
     assert capsys.readouterr().out.startswith('OK [[')
     pair, true = names['pair'], np.linalg.inv(poses[1]) @ poses[0]
     assert pair.status is djet_ros.Status.OK
@@ -64,10 +76,23 @@ def test_the_python_example_of_the_readme_estimates_the_motion_between_two_image
     assert np.degrees(direction_angle(pair.t, true[:3, 3])) < 1
 
 
+@pytest.mark.parametrize(('page', 'index'), [('README.md', 0), ('doc/without-ros.md', 1)])
+def test_the_examples_of_an_odometry_estimate_the_path_of_a_camera(road, capsys, page, index):
+    names, poses = road
+    names = dict(names)
+    exec(examples(page)[index], names)
+    assert re.findall('^[A-Z_]+', capsys.readouterr().out, re.MULTILINE) == [
+        'FIRST_FRAME', 'OK', 'OK']
+    pose, true = names['result'].pose, np.linalg.inv(poses[0]) @ poses[2]
+    assert np.degrees(rotation_angle(pose[:3, :3], true[:3, :3])) < 0.1
+    assert np.degrees(direction_angle(pose[:3, 3], true[:3, 3])) < 1
+
+
 def test_the_package_imports_its_api_lazily():
     subprocess.run([sys.executable, '-c', 'import sys, djet_ros\n'
                     'assert not {"numpy", "cv2", "scipy"} & set(sys.modules)\n'
-                    'from djet_ros import preset, Status, TwoViewEstimator\n'
+                    'from djet_ros import Frame, OdometryConfig, preset, Status\n'
+                    'from djet_ros import TwoViewEstimator, VisualOdometry\n'
                     'TwoViewEstimator(preset("fast"))\n'
                     'assert "matplotlib" not in sys.modules\n'
                     'assert not hasattr(djet_ros, "Statues")'], check=True)

@@ -14,7 +14,7 @@ from djet_ros.recordings.outputs import check_file, make_folder, write_whole
 
 # Formats of recordings, for help texts.
 RECORDINGS = ('rosbag2, ROS 1 bag, or folder of KITTI (odometry, raw), TUM RGB-D, 7-Scenes, '
-              'EuRoC, TUM-VI or VAROS')
+              'EuRoC, TUM-VI, VAROS, or of images with calibration.yaml or calibration.txt')
 
 
 def output_path(text: str) -> Path:

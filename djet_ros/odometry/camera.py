@@ -72,7 +72,7 @@ class Camera:
         """
         _check_camera(K)
         self.raw_K, self.K, self.size = K, K if pinhole is None else pinhole, size
-        self._distortion = _distortion(model, D) if is_distorted(model, D) else None
+        self._distortion = checked_distortion(model, D) if is_distorted(model, D) else None
         if self._distortion is not None and K[0, 1]:
             raise BadMessage('bad_calibration', (
                 f'the skew {K[0, 1]:g} of images with a distortion is not known to OpenCV; '
@@ -308,7 +308,8 @@ def check_lens(K: Array, size: tuple[int, int]) -> None:
             f'no sensor has the skew {K[0, 1]:g}, {K[1, 0]:g}; {_CALIBRATE}'))
 
 
-def _distortion(model: str, D: Array) -> tuple[str, Array]:
+def checked_distortion(model: str, D: Array) -> tuple[str, Array]:
+    """Return a model and its coefficients; raise BadMessage if it has not so many."""
     counts: Sequence[int] = _MODELS.get(model, ())
     if len(D) not in counts:
         raise BadMessage('unknown_distortion', f"distortion model '{model:.40}' with {len(D)} "

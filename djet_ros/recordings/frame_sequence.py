@@ -38,10 +38,10 @@ class FrameSequence:
 
     name: for display; K: (3, 3) camera matrix in pixels, pixel centres at integers; distortion:
     OpenCV's coefficients of the model ('plumb_bob': k1, k2, p1, p2 and k3, zeros if the images
-    are rectified; or 'equidistant': k1 to k4); size: (width, height); frame_paths: the files;
-    stamps_ns: (N,) int64, strictly increasing, never 0; poses: (N, 4, 4), camera in the frame of
-    the first known pose, NaN for frames without ground truth, or None without any; imu: samples
-    of an IMU on the camera, or None.
+    are rectified; 'rational_polynomial': up to 14; 'equidistant': k1 to k4); size: (width,
+    height); frame_paths: the files; stamps_ns: (N,) int64, strictly increasing, never 0; poses:
+    (N, 4, 4), camera in the frame of the first known pose, NaN for frames without ground truth,
+    or None without any; imu: samples of an IMU on the camera, or None.
     """
 
     def __init__(self, name: str, images: ImageFiles, K: Array, stamps_ns: NDArray[np.int64],
@@ -50,8 +50,8 @@ class FrameSequence:
         self.name = name
         self.K = K
         self.model = model
-        padded = [*distortion, *[0.0] * 5]
-        self.distortion = np.array(padded[:4 if model == 'equidistant' else 5])
+        padding = (4 if model == 'equidistant' else 5) - len(distortion)
+        self.distortion = np.array([*distortion, *[0.0] * padding])
         self.size, self.frame_paths = images.size, images.paths
         self.stamps_ns = stamps_ns
         self.poses = poses

@@ -46,7 +46,7 @@ class KittiSequence(FrameSequence):
         chosen = _frame_range(len(paths), start, end, self.folder)
         K = read_camera(self.folder / 'calib.txt')
         distortion = _distortion(self.folder / 'calib.txt')
-        stamps = _stamps(self.folder / 'times.txt', len(paths))[chosen]
+        stamps = read_times(self.folder / 'times.txt', len(paths))[chosen]
         images = ImageFiles(paths[chosen])
         truth = None
         if own_poses and poses is None:
@@ -151,7 +151,8 @@ def _frame_range(count: int, start: int, end: int | None, folder: Path) -> slice
     return slice(start, stop)
 
 
-def _stamps(path: Path, count: int) -> NDArray[np.int64]:
+def read_times(path: Path, count: int) -> NDArray[np.int64]:
+    """Return stamps in ns of a times.txt, seconds of each of `count` images; raise DjetError."""
     stamps, _ = stamped_rows(path, 1, nanoseconds)
     _check_length(path, len(stamps), count)
     return increasing(stamps, path) + STAMP_OFFSET_NS
@@ -170,5 +171,5 @@ def _poses(path: Path, count: int) -> Array:
 
 def _check_length(path: Path, have: int, count: int) -> None:
     if have != count:
-        raise DjetError(f'{path} has {have} lines for {count} images in image_0; it must have '
-                        'one per image')
+        raise DjetError(f'{path} has {have} lines for {count} images; it must have one '
+                        'per image')

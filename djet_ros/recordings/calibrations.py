@@ -1,0 +1,160 @@
+"""The camera of a folder of images, from its calibration file in one of several formats."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from djet_ros.config.safe_files import read_yaml
+from djet_ros.core.types import Array
+from djet_ros.errors import DjetError, one_line
+from djet_ros.odometry.camera import checked_distortion
+from djet_ros.odometry.images import BadMessage
+from djet_ros.recordings.kitti import check_rigid
+from djet_ros.recordings.text import lines, numbers
+import numpy as np
+
+# Files beside the images: of numbers alone, and as the camera_calibration of ROS writes it.
+PLAIN, YAML = 'calibration.txt', 'calibration.yaml'
+
+# Names of OpenCV's two distortion models in ASL and Kalibr files, and numbers of coefficients.
+_ASL_MODELS = {'radial-tangential': ('plumb_bob', (0, 4, 5)), 'radtan': ('plumb_bob', (4,)),
+               'none': ('plumb_bob', (0,)), 'equidistant': ('equidistant', (4,))}
+
+# What reading a value of another type, or of none, out of YAML may raise.
+_UNFIT = (AttributeError, KeyError, OverflowError, TypeError, ValueError)
+
+
+class Intrinsics(NamedTuple):
+    """K (3, 3) in pixels, and the distortion by OpenCV's coefficients of a model."""
+
+    K: Array
+    distortion: Sequence[float] = ()
+    model: str = 'plumb_bob'
+
+
+def camera_beside(folder: Path, size: tuple[int, int], published: Sequence[float] = ()
+                  ) -> Intrinsics:
+    """
+    Return the camera of calibration.txt or calibration.yaml in a folder of images.
+
+    The text is "fx fy cx cy [k1 k2 p1 p2 [k3]]", and so is `published`, which holds without any
+    file. The YAML is that of ROS's camera_calibration, or of OpenCV. size: (width, height) of the
+    images. Raises DjetError if there is no camera, or an invalid one.
+    """
+    plain, ros = folder / PLAIN, folder / YAML
+    if ros.exists():
+        if plain.exists():
+            raise DjetError(f'{folder} has {PLAIN} and {YAML}; remove the one that is not of '
+                            'these images')
+        return _of_yaml(ros, size)
+    values = tuple(published)
+    if plain.exists():
+        _, text = next(lines(plain), (0, ''))
+        try:
+            values = tuple(numbers(text))
+        except ValueError as error:
+            raise DjetError(f'{plain}: {error}') from error
+    if len(values) not in (4, 8, 9):
+        raise DjetError(f"{folder} has no known camera; write 'fx fy cx cy', perhaps with "
+                        f"'k1 k2 p1 p2 k3', into {plain}, or name a file of ROS's "
+                        f'camera_calibration {YAML}')
+    return Intrinsics(_matrix(values[:4], values[4:], plain), values[4:])
+
+
+def _of_yaml(path: Path, size: tuple[int, int]) -> Intrinsics:
+    content = read_yaml(path)
+    try:
+        matrix = np.array(content['camera_matrix']['data'], dtype=np.float64).reshape(9)
+        distortion = np.array(content['distortion_coefficients']['data'], np.float64).ravel()
+        model = str(content.get('distortion_model', 'plumb_bob'))
+        calibrated = int(content['image_width']), int(content['image_height'])
+    except _UNFIT as error:
+        raise DjetError(f'{path} is no calibration of ROS (camera_matrix, distortion_coefficients,'
+                        f' image_width, image_height): {one_line(error)}') from error
+    if calibrated != size:
+        raise DjetError(f'{path} is of {calibrated[0]}x{calibrated[1]} pixels, the images have '
+                        f'{size[0]}x{size[1]}; calibrate at this size')
+    fx, skew, cx, *_, fy, cy = matrix[:6]
+    if [skew, *matrix[[3, 6, 7, 8]]] != [0, 0, 0, 0, 1]:
+        raise DjetError(f'{path}: camera_matrix is {one_line(matrix.tolist())}; it must be fx 0 '
+                        'cx 0 fy cy 0 0 1')
+    if len(distortion):
+        try:
+            checked_distortion(model, distortion)
+        except BadMessage as error:
+            raise DjetError(f'{path}: {error}') from error
+    return Intrinsics(_matrix((fx, fy, cx, cy), distortion.tolist(), path), distortion.tolist(),
+                      model)
+
+
+def asl_camera(path: Path) -> tuple[Intrinsics, Array]:
+    """Return the camera of a sensor.yaml, and its pose (4, 4) in the body."""
+    sensor = read_yaml(path)
+    if not isinstance(sensor, dict):
+        raise DjetError(f'{path} is no ASL camera description: it has neither intrinsics nor '
+                        'T_BS; replace the file, which may be truncated')
+    try:
+        named = sensor.get('distortion_model', 'radial-tangential')
+        intrinsics = [float(value) for value in sensor['intrinsics']]
+        distortion = [float(value) for value in sensor.get('distortion_coefficients', [])]
+        camera_in_body = rigid(sensor['T_BS']['data'])
+    except _UNFIT as error:
+        raise DjetError(f'{path} is no ASL camera description (intrinsics, T_BS): '
+                        f'{one_line(error)}') from error
+    check_rigid(camera_in_body[None], path)
+    return _with_model(path, named, intrinsics, distortion), camera_in_body
+
+
+def kalibr_camera(path: Path) -> tuple[Intrinsics, Array]:
+    """Do the same for cam0 of a Kalibr camera chain, whose T_cam_imu is the inverse pose."""
+    chain = read_yaml(path)
+    try:
+        camera = chain['cam0']
+        named = camera['distortion_model']
+        intrinsics = [float(value) for value in camera['intrinsics']]
+        distortion = [float(value) for value in camera['distortion_coeffs']]
+        body_in_camera = rigid(camera['T_cam_imu'])
+    except _UNFIT as error:
+        raise DjetError(f'{path} is no Kalibr camera chain (cam0: intrinsics, T_cam_imu): '
+                        f'{one_line(error)}') from error
+    check_rigid(body_in_camera[None], path)
+    camera_in_body = np.asarray(np.linalg.inv(body_in_camera))
+    return _with_model(path, named, intrinsics, distortion), camera_in_body
+
+
+def asl_mounting(path: Path) -> Array:
+    """Return the pose (4, 4) of a sensor in the body, from its sensor.yaml."""
+    sensor = read_yaml(path)
+    try:
+        pose = rigid(sensor['T_BS']['data'])
+    except _UNFIT as error:
+        raise DjetError(f'{path} is no ASL sensor description (T_BS): '
+                        f'{one_line(error)}') from error
+    check_rigid(pose[None], path)
+    return pose
+
+
+def rigid(values: object) -> Array:
+    """Return 16 numbers as a matrix (4, 4); raises ValueError or TypeError for other values."""
+    return np.array(values, dtype=np.float64).reshape(4, 4)
+
+
+def _with_model(path: Path, named: object, intrinsics: Sequence[float],
+                distortion: Sequence[float]) -> Intrinsics:
+    """Return the camera of a file of ASL or Kalibr, with OpenCV's name of its model."""
+    model, counts = _ASL_MODELS.get(str(named), ('', ()))
+    if len(intrinsics) != 4 or len(distortion) not in counts:
+        raise DjetError(f"{path}: distortion model '{one_line(named, 40)}' with "
+                        f'{len(intrinsics)} intrinsics and {len(distortion)} coefficients; '
+                        'supported are radial-tangential and equidistant, with 4 and 4')
+    return Intrinsics(_matrix(intrinsics, distortion, path), distortion, model)
+
+
+def _matrix(intrinsics: Sequence[float], distortion: Sequence[float], path: Path) -> Array:
+    fx, fy, cx, cy = intrinsics
+    if not (fx > 0 and fy > 0 and np.isfinite([*intrinsics, *distortion]).all()):
+        raise DjetError(f'{path}: fx fy cx cy = {fx:g} {fy:g} {cx:g} {cy:g} is no valid camera; '
+                        'focal lengths must be positive')
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
