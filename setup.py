@@ -30,6 +30,7 @@ setup(
     maintainer_email='maintainers@djet-ros.invalid',
     license='Apache-2.0',
     packages=find_packages(exclude=['test']),
+    package_data={package_name: ['py.typed']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
         (f'share/{package_name}', ['package.xml']),

@@ -718,7 +718,7 @@ def test_views_of_two_cameras_are_rejected():
 @pytest.mark.parametrize('image', [np.zeros((40, 60, 3), np.uint8), np.zeros((40, 60)),
                                    np.zeros((40, 60), np.uint16)])
 def test_an_image_other_than_8_bit_gray_is_rejected(image):
-    with pytest.raises(ValueError, match='expected an image'):
+    with pytest.raises(ValueError, match='expected a gray image'):
         TwoViewEstimator().view(image, K)
 
 

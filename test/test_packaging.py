@@ -133,6 +133,13 @@ def test_pip_puts_the_commands_into_bin(environment: Path) -> None:
     assert shares_its_files(environment)
 
 
+def test_type_checkers_see_the_types_of_the_installed_package(environment: Path) -> None:
+    assert run(environment / 'bin' / 'python', '-c', 'from importlib.util import find_spec\n'
+               'from pathlib import Path\n'
+               'print(Path(find_spec("djet_ros").origin).with_name("py.typed").exists())',
+               cwd=environment) == 'True\n'
+
+
 def has_compiled_loops(python: Path, cwd: Path) -> bool:
     """Return whether the package installed for an interpreter has the compiled loops."""
     return run(python, '-c', 'from pathlib import Path\n'

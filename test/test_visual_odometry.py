@@ -110,6 +110,15 @@ def test_after_an_undecided_pair_its_matches_are_not_reused():
     assert np.array_equal(estimator.estimate(*views[3:], motion).x, after.x)
 
 
+@pytest.mark.parametrize(('gray', 'got'), [
+    (np.zeros((48, 64, 3), np.uint8), r'\(48, 64, 3\) uint8'),
+    (np.zeros((48, 64)), r'\(48, 64\) float64'),
+])
+def test_a_frame_that_is_no_gray_image_is_refused_with_its_shape(gray, got):
+    with pytest.raises(ValueError, match=f'expected a gray image .* got {got}'):
+        Frame(gray, np.eye(3), 1)
+
+
 @pytest.mark.slow
 def test_a_compromise_between_two_bodies_does_not_persist():
     scene = make_scene('moving_object', size=(620, 188))

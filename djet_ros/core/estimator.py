@@ -39,7 +39,16 @@ from djet_ros.core.surfaces import (
 )
 from djet_ros.core.three_views import of_followed_body
 from djet_ros.core.tracking import track_jointly
-from djet_ros.core.types import Array, Features, of_same_camera, Pose, RelativePose, Status, View
+from djet_ros.core.types import (
+    Array,
+    Features,
+    of_same_camera,
+    Pose,
+    RelativePose,
+    require_gray,
+    Status,
+    View,
+)
 from djet_ros.core.verdict import verdict, with_left_out
 import numpy as np
 from numpy.typing import NDArray
@@ -73,9 +82,7 @@ class TwoViewEstimator:
         type.
         """
         K = np.asarray(K, np.float64)
-        if gray.ndim != 2 or gray.dtype != np.uint8 or K.shape != (3, 3):
-            raise ValueError('expected an image (H, W) uint8 and K (3, 3), got '
-                             f'{gray.shape} {gray.dtype} and {K.shape}')
+        require_gray(gray, K)
         if self.k1:
             gray, left_out = undistort_image(gray, K, self.k1, left_out)
         mask = None if left_out is None else blocked(left_out)

@@ -111,6 +111,13 @@ def of_same_camera(one: Picture, other: Picture) -> bool:
     return one.gray.shape == other.gray.shape and np.array_equal(one.K, other.K)
 
 
+def require_gray(gray: NDArray[np.uint8], K: Array) -> None:
+    """Raise ValueError unless an image is (H, W) uint8 and K (3, 3)."""
+    if gray.ndim != 2 or gray.dtype != np.uint8 or K.shape != (3, 3):
+        raise ValueError('expected a gray image (H, W) uint8 and K (3, 3), got '
+                         f'{gray.shape} {gray.dtype} and {K.shape}')
+
+
 @dataclass(frozen=True)
 class View:
     """

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from djet_ros.core.estimator import TwoViewEstimator
-from djet_ros.core.types import Array, of_same_camera, RelativePose, Status, View
+from djet_ros.core.types import Array, of_same_camera, RelativePose, require_gray, Status, View
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +17,8 @@ class Frame:
 
     gray: (H, W) uint8, undistorted; K: (3, 3) its camera matrix in pixels, pixel centres at
     integers; stamp_ns: time of exposure in nanoseconds; frame_id: name of the camera's frame;
-    left_out: (H, W) bool, mask of pixels to ignore, or None.
+    left_out: (H, W) bool, mask of pixels to ignore, or None. Raises ValueError for an image or a K
+    of another shape or type.
     """
 
     gray: NDArray[np.uint8]
@@ -25,6 +26,10 @@ class Frame:
     stamp_ns: int
     frame_id: str = 'camera'
     left_out: NDArray[np.bool_] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what no view can be prepared of, before the odometry starts on it."""
+        require_gray(self.gray, self.K)
 
     def view(self, estimator: TwoViewEstimator) -> View:
         """Return the view that an estimator prepares of it, without the ignored pixels."""
