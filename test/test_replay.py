@@ -457,6 +457,22 @@ def test_written_configuration_combines_flags_and_file(bag, tmp_path):
     assert np.allclose(lengths[moved], np.linalg.norm(STEP[:3, 3]), atol=1e-6)
 
 
+def test_debug_images_are_those_of_the_node_and_go_when_results_are_replaced(folder, tmp_path):
+    results, drawn = tmp_path / 'results', tmp_path / 'results' / 'debug'
+    djet('replay', folder, '--output', results, '--debug-images')
+    assert [path.name for path in sorted(drawn.iterdir())] == [
+        f'{i:06d}.jpg' for i in range(1, FRAMES)]
+    picture = cv2.imread(str(drawn / '000003.jpg'))
+    gray = cv2.imread(str(folder / 'image_0' / '000003.png'), cv2.IMREAD_GRAYSCALE)
+    assert picture.shape == (*gray.shape, 3)
+    coloured = np.ptp(picture.astype(int), axis=2) > 90
+    green = coloured & (picture.argmax(2) == 1)
+    assert green.mean() > 0.005
+    assert np.abs(picture.mean(2) - gray)[~coloured].mean() < 20
+    djet('replay', folder, '--output', results, '--overwrite')
+    assert not drawn.exists()
+
+
 @pytest.mark.slow
 def test_only_results_are_overwritten_and_only_on_request(bag, replayed, tmp_path):
     results = tmp_path / 'results'

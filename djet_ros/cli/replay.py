@@ -21,7 +21,7 @@ from djet_ros.errors import DjetError
 from djet_ros.odometry.scale import Scale
 from djet_ros.recordings.recording import AUXILIARY, open_recording
 from djet_ros.replay.replay import Outcome, Replay
-from djet_ros.replay.results import PLOT, ResultsFolder
+from djet_ros.replay.results import DEBUG, PLOT, ResultsFolder
 from rich.table import Table
 
 DESCRIPTION = """\
@@ -55,6 +55,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument('source', type=Path, metavar='SOURCE', help=RECORDINGS)
     add_output(parser, 'folder for the results')
+    parser.add_argument('--debug-images', action='store_true',
+                        help=f'also write {DEBUG}/NNNNNN.jpg for each pair: displacements of '
+                        'inliers (green) and outliers (red), and 20 times the distances from the '
+                        'epipolar lines (yellow)')
     add_replay_options(parser, _FLAGS)
 
 
@@ -72,7 +76,8 @@ def add_replay_options(parser: argparse.ArgumentParser, flags: Iterable[str]) ->
 
 def run(args: argparse.Namespace) -> int:
     """Replay with a progress bar on stderr, and print the summary on stdout."""
-    with opened_replay(args, configuration(args), args.source, args.output) as replay:
+    with opened_replay(args, configuration(args), args.source, args.output,
+                       args.debug_images) as replay:
         outcome = replay()
     if outcome.summary['frames']:
         console().print(_table(outcome.summary))
@@ -93,20 +98,20 @@ def configuration(args: argparse.Namespace, *nodes: str) -> Config:
 
 
 @contextmanager
-def opened_replay(args: argparse.Namespace, config: Config, recording: Path, folder: Path
-                  ) -> Iterator[Callable[[], Outcome]]:
+def opened_replay(args: argparse.Namespace, config: Config, recording: Path, folder: Path,
+                  draw: bool = False) -> Iterator[Callable[[], Outcome]]:
     """
     Open a recording with the topics and poses of the options; yield a function that replays it.
 
     The results folder is cleared only after the recording was opened: on an error the results of
-    an earlier run are kept.
+    an earlier run are kept. draw: whether to write drawings of the pairs.
     """
     wanted = _auxiliary_inputs(config.odometry)
     check_topics(args, wanted)
     with open_recording(recording, args.image_topic, args.info_topic, args.poses,
                         auxiliary={what: getattr(args, f'{what}_topic', None)
                                    for what in wanted}, damaged=True) as source:
-        replay = Replay(source, config, str(recording))
+        replay = Replay(source, config, str(recording), draw)
         with ResultsFolder(folder, config, args.overwrite) as results, \
                 progress_bar('replay', len(source)) as advance:
             yield partial(replay.run, results, advance)

@@ -378,14 +378,20 @@ class Tracker:
             stamp, f'{self._node}: visual odometry', diagnosis.level, diagnosis.summary,
             diagnosis.values, self.last.frame_id if self.last else ''))
 
-    def debug_image(self) -> Outgoing | None:
-        """Return a drawing of the last pair, None without one; for subscribers, as it is slow."""
+    def drawing(self) -> NDArray[np.uint8] | None:
+        """Draw the last pair, (H, W, 3) BGR; None without one. Slow: only on demand."""
         if self._frame is None or self.last is None or self.last.relative is None:
             return None
+        gray = self._odometry.estimator.undistorted(self._frame.gray, self._frame.K)
+        return debug_image(gray, self.last.relative)
+
+    def debug_image(self) -> Outgoing | None:
+        """Return the same as a message, for subscribers; None without a pair."""
+        picture = self.drawing()
+        if picture is None or self._frame is None:
+            return None
         return Outgoing('debug_image', self._messages.picture(
-            self._frame.stamp_ns, self._frame.frame_id,
-            debug_image(self._odometry.estimator.undistorted(self._frame.gray, self._frame.K),
-                        self.last.relative)))
+            self._frame.stamp_ns, self._frame.frame_id, picture))
 
     def landmarks(self) -> Outgoing | None:
         """Return the landmarks in the last frame; None without any."""

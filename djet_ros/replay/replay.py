@@ -66,11 +66,16 @@ class Replay:
     summary and the outcome.
     """
 
-    def __init__(self, recording: Recording, config: Config, name: str) -> None:
-        """Prepare the run; DjetError if a parameter needs what the recording does not have."""
+    def __init__(self, recording: Recording, config: Config, name: str,
+                 draw: bool = False) -> None:
+        """
+        Prepare the run; DjetError if a parameter needs what the recording does not have.
+
+        draw: whether to write a drawing of each pair, which takes about as long as a fifth of it.
+        """
         self._recording = recording
         self._config = config
-        self._name = name
+        self._name, self._draw = name, draw
         self._frames = _static_frames(recording) if config.odometry.base_frame else StaticFrames()
         self._tracker = Tracker(config, message_type, _scale(recording, config),
                                 recording.image_topic,
@@ -187,6 +192,8 @@ class Replay:
                                         result.motion_covariance, result.scale_known,
                                         metric=result.metric, keyframe=result.keyframe))
             self._folder.add_frame(number, result, seconds)
+            if self._draw and (drawing := tracker.drawing()) is not None:
+                self._folder.add_drawing(number, drawing)
             self._folder.add_landmarks(tracker.settled())
         else:
             self._folder.add_unused(number, stamp_ns(message.message.header), tracker.verdict)

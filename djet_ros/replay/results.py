@@ -5,6 +5,7 @@ The results folder of a replay; files are written during the run, so that nothin
   camera, in optical axes; the last known pose if the motion could not be estimated
 * frames.csv: one row per image
 * landmarks.ply: the landmarks that propagated the scale, in the first camera, if there are any
+* debug/: drawings of the pairs, named by their image in frames.csv, if they were asked for
 * bag/: the messages that a live node would have published
 * config.yaml: the effective parameters
 * summary.json: counts, errors, and whether the run completed
@@ -21,6 +22,7 @@ from pathlib import Path
 import shutil
 from typing import Any
 
+import cv2
 from djet_ros.config.sections import Config, NODE_NAME
 from djet_ros.config.yaml_files import dump_yaml
 from djet_ros.core.types import Array
@@ -43,6 +45,7 @@ SUMMARY = 'summary.json'
 PLOT = 'trajectory.png'
 BAG = 'bag'
 LANDMARKS = 'landmarks.ply'
+DEBUG = 'debug'
 _FILES = (SUMMARY, PLOT, LANDMARKS, 'trajectory_tum.txt', 'trajectory_kitti.txt', 'frames.csv',
           'errors.csv', 'config.yaml')
 
@@ -68,7 +71,7 @@ class ResultsFolder(Closing):
         self.path = path
         present = path.exists()
         with self._beginning():
-            make_room(path, (*_FILES, BAG), overwrite, marks=(SUMMARY, 'config.yaml'))
+            make_room(path, (*_FILES, BAG, DEBUG), overwrite, marks=(SUMMARY, 'config.yaml'))
         try:
             with self._beginning():
                 self._begin(config)
@@ -130,6 +133,15 @@ class ResultsFolder(Closing):
             self._landmarks.add(places)
         except OSError as error:
             raise _blame(self.path, error) from error
+
+    def add_drawing(self, image: int, drawing: NDArray[np.uint8]) -> None:
+        """Write a drawing (H, W, 3) BGR of the pair that ends with an image (number from 0)."""
+        path = self.path / DEBUG / f'{image:06d}.jpg'
+        try:
+            path.parent.mkdir(exist_ok=True)
+            path.write_bytes(cv2.imencode('.jpg', drawing)[1].tobytes())
+        except OSError as error:
+            raise _blame(path, error) from error
 
     def publish(self, outgoing: Outgoing, stamp_ns: int) -> None:
         """Write a message under the topic of the live node."""
