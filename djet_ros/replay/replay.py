@@ -309,7 +309,7 @@ class Replay:
             summary['positions'] = log.positions(truth)
             self._folder.add_errors(pairs, errors)
         if any(step.tracked for step in log.steps):
-            log.plot(self._folder.path / PLOT, truth,
+            log.plot(self._folder.path / PLOT, truth, self._folder.landmarks_from_above,
                      f'{one_line(Path(self._name).name)}: {config.estimator.method}, '
                      f'{config.preset}')
 

@@ -90,6 +90,8 @@ class ResultsFolder(Closing):
                               KittiWriter(self.path / 'trajectory_kitti.txt')]
         self._bag = ResultBag(self.path / BAG)
         self._landmarks: PointFile | None = None
+        # From above, for the plot at the end.
+        self._map: list[NDArray[np.float32]] = []
 
     @contextmanager
     def _beginning(self) -> Iterator[None]:
@@ -133,6 +135,12 @@ class ResultsFolder(Closing):
             self._landmarks.add(places)
         except OSError as error:
             raise _blame(self.path, error) from error
+        self._map.append(places[:, [0, 2]].astype(np.float32))
+
+    @property
+    def landmarks_from_above(self) -> NDArray[np.float32]:
+        """Return x and z (M, 2) of all landmarks so far, in the first camera."""
+        return np.concatenate([np.empty((0, 2), np.float32), *self._map])
 
     def add_drawing(self, image: int, drawing: NDArray[np.uint8]) -> None:
         """Write a drawing (H, W, 3) BGR of the pair that ends with an image (number from 0)."""
@@ -224,12 +232,12 @@ def _widen(axes: Any) -> None:
         widen(limit.mean() - half, limit.mean() + half)
 
 
-def plot_trajectory(path: Path, estimate: Array, truth: Array | None, title: str,
-                    unit: str) -> None:
+def plot_trajectory(path: Path, estimate: Array, truth: Array | None,
+                    landmarks: NDArray[np.float32], title: str, unit: str) -> None:
     """
     Plot a trajectory from above (x right, z forward), from positions (N, 3) in the first camera.
 
-    truth: (M, 3) or None; unit: unit of the axes.
+    truth: (M, 3) or None; landmarks: (M, 2), x and z; unit: unit of the axes.
     """
     # Imported here, as it takes half a second and only the end of a replay needs it.
     from matplotlib.figure import Figure
@@ -244,6 +252,8 @@ def plot_trajectory(path: Path, estimate: Array, truth: Array | None, title: str
     # A $ in the name of a folder is not a formula.
     axes.set_title(title, parse_math=False)
     _widen(axes)
+    # Far landmarks are outside: the path decides what is shown.
+    axes.plot(*landmarks.T, ',', color='0.6', zorder=0, scalex=False, scaley=False)
     axes.grid(color='0.9')
     axes.legend(loc='best')
     try:

@@ -143,9 +143,13 @@ class StepLog:
                 'way_m': float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()),
                 'scale_change': change if np.isfinite(change) else None}
 
-    def plot(self, path: Path, truth: Array, title: str) -> None:
-        """Plot the trajectory; an unknown scale is taken from the true poses (N, 4, 4)."""
-        unit = 'm'
+    def plot(self, path: Path, truth: Array, landmarks: NDArray[np.float32], title: str) -> None:
+        """
+        Plot the trajectory; an unknown scale is taken from the true poses (N, 4, 4).
+
+        landmarks: (M, 2) x and z, in the lengths of the estimate.
+        """
+        unit, factor = 'm', 1.0
         estimate = np.array([step.pose for step in self.steps])
         known = np.flatnonzero(np.isfinite(truth).all(axis=(1, 2)))
         if self.scale is Scale.UNKNOWN and known.size:
@@ -154,14 +158,16 @@ class StepLog:
         elif self.scale is Scale.UNKNOWN:
             unit = 'steps of unit length'
         elif self.scale is Scale.RELATIVE and known.size:
-            estimate[:, :3, 3] *= path_scale(estimate[known, :3, 3], truth[known, :3, 3])
+            factor = path_scale(estimate[known, :3, 3], truth[known, :3, 3])
+            estimate[:, :3, 3] *= factor
             title += '\n(common scale from ground truth)'
         elif self.scale is Scale.RELATIVE:
             unit = 'lengths of the first step'
         # The two coincide at the first pose of the ground truth.
         positions = (estimate[known[0]] @ np.linalg.inv(truth[known[0]]) @ truth)[:, :3, 3] \
             if known.size else None
-        plot_trajectory(path, estimate[:, :3, 3], positions, title, unit)
+        plot_trajectory(path, estimate[:, :3, 3], positions,
+                        np.asarray(factor * landmarks, np.float32), title, unit)
 
     def _with_true_lengths(self, truth: Array) -> Array:
         """Return the estimated poses (N, 4, 4) with the true length of each step, if known."""
