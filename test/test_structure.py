@@ -168,7 +168,8 @@ def test_an_ambiguous_pair_that_agrees_with_the_landmarks_keeps_the_scale(cards)
         scale.bridge((7 * 10**8, 8 * 10**8), views[8], pair, np.eye(4))
         found.append(scale.of_step((8 * 10**8, 9 * 10**8), views[9], pairs[-1]).length.value)
     assert found[0] == pytest.approx(1, abs=0.04)
-    assert found[1] == pytest.approx(0.46 / 0.32, abs=0.06)  # interrupted: at the last speed
+    # Interrupted: the camera was faster before, but what it sees is as far away as it was.
+    assert found[1] == pytest.approx(1, abs=0.04)
 
 
 def test_standing_still_and_rotating_in_place_keep_the_scale(cards):

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from djet_ros.core.bundle import Landmarks, points_in_frame, Poses, projected
-from djet_ros.core.geometry import depths_in_second, inverse_depths
+from djet_ros.core.geometry import depths_in_second, inverse_depths, sphere_tangents
 from djet_ros.core.paraboloid import median, weighted_median
 from djet_ros.core.radial import undistorted_rays
+from djet_ros.core.sketch import moved_all
 from djet_ros.core.types import Array, Pose, RelativePose
 import numpy as np
 from numpy.typing import NDArray
@@ -22,26 +23,46 @@ from scipy.spatial import cKDTree
 # chosen: pixels between a known point and a match of a pair up to which they are the same point.
 _MATCH_RADIUS = 1.5
 
+# Cosine of the angle to the optical axis up to which a point is seen after a rotation.
+_LEAST_AHEAD = 0.1
+
 # Robust standard deviations beyond which a depth disagrees; chosen: largest error of an inlier
 # match, in pixels; and largest relative error of a landmark's depth.
 _OUTLIER, _MATCH_ERROR, _DEPTH_ERROR = 4.0, 0.4, 0.15
 
 
 class Lengths(NamedTuple):
-    """Lengths (M,) of a pair by each of some points, and their weights (M,)."""
+    """
+    Lengths (M,) of a pair by each of some points, and their weights (M,).
+
+    by_pose: (5, M) the same if the pose of the pair is one standard deviation off, along each axis
+    of its covariance.
+    """
 
     values: Array
     weights: Array
+    by_pose: Array
 
     def median(self) -> float:
         """Return the weighted median."""
-        return weighted_median(*self)
+        return weighted_median(self.values, self.weights)
 
     def standard_error(self) -> float:
         """Return the standard error of the median, for the effective number of weights."""
         deviations = np.abs(self.values - self.median())
         sigma = 1.25 * 1.4826 * weighted_median(deviations, self.weights)
         return sigma * float(np.sqrt((self.weights**2).sum()) / self.weights.sum())
+
+    def noise(self) -> float:
+        """
+        Return the standard deviation of the median, also due to the pose.
+
+        A rotation that is a pixel off changes the parallax of all points by that pixel, however
+        well they agree.
+        """
+        length = self.median()
+        common = [weighted_median(values, self.weights) - length for values in self.by_pose]
+        return float(np.linalg.norm([*common, self.standard_error()]))
 
 
 @dataclass(frozen=True)
@@ -76,11 +97,27 @@ class KnownDepths:
         ahead = (rho > 0) & (depths > 0)
         return cls(y[ahead], rho[ahead] / (depths[ahead] * length), K, k1)
 
-    def lengths(self, pair: RelativePose) -> Lengths:
-        """Return the lengths of a pair that starts at the frame, by points with an inlier."""
-        rho, scaled, sigma = self._triangulated(Pose(pair.R, pair.t), pair.x[pair.inliers],
-                                                pair.y_opt[pair.inliers])
-        return Lengths(scaled / rho, rho / sigma)
+    def rotated(self, R: Array) -> KnownDepths:
+        """Return the points as they are seen after a rotation (3, 3) of the camera on the spot."""
+        rays = undistorted_rays(self.K, self.pixels, self.k1) @ R.T
+        ahead = rays[:, 2] > _LEAST_AHEAD
+        rays = rays[ahead]
+        return KnownDepths(projected(self.K, rays, self.k1), self.rho[ahead] / rays[:, 2], self.K,
+                           self.k1)
+
+    def lengths(self, pair: RelativePose, radius: float = _MATCH_RADIUS) -> Lengths:
+        """
+        Return the lengths of a pair that starts at the frame, by points with an inlier.
+
+        radius: pixels between the two; those far from each other have about the same depth.
+        """
+        rho, rays_x, rays_y = self._matched(pair.x[pair.inliers], pair.y_opt[pair.inliers], radius)
+        scaled, sigma = inverse_depths(pair.R, pair.t, rays_x, rays_y)
+        variances, axes = np.linalg.eigh(pair.covariance_5)
+        steps = (axes * np.sqrt(np.maximum(variances, 0.0))).T
+        moved = [inverse_depths(R, t, rays_x, rays_y)[0] for R, t in zip(
+            *moved_all(pair.R, pair.t, sphere_tangents(pair.t), steps))]
+        return Lengths(scaled / rho, rho / sigma, np.array(moved) / rho)
 
     def count_agreeing(self, pose: Pose, x: Array, y: Array) -> tuple[int, int]:
         """
@@ -89,9 +126,10 @@ class KnownDepths:
         pose: from the frame to another one, the sign of t is free; x, y: (N, 2) matched pixels of
         the two. The length of the motion is the one that most of the points agree with.
         """
-        rho, scaled, sigma = self._triangulated(pose, x, y)
+        rho, rays_x, rays_y = self._matched(x, y)
         if not len(rho):
             return 0, 0
+        scaled, sigma = inverse_depths(pose.R, pose.t, rays_x, rays_y)
         ratios = scaled / rho
         # By near points, which have most parallax but may be of another body, or by all with equal
         # weight.
@@ -101,24 +139,16 @@ class KnownDepths:
             _OUTLIER * noise + _DEPTH_ERROR * np.abs(lengths) * rho)
         return int(agree.sum(1).max()), len(rho)
 
-    def _triangulated(self, pose: Pose, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """
-        Return the inverse depths (M,) of points with a match in x, y (N, 2): known and by a pose.
-
-        The latter are in units of its translation, and come with their standard deviations (M,)
-        for matches with an error of one in X/Z, Y/Z.
-        """
-        rho, match = self._matched(x)
+    def _matched(self, x: Array, y: Array, radius: float = _MATCH_RADIUS
+                 ) -> tuple[Array, Array, Array]:
+        """Return the inverse depths (M,) of points with a match in x, y (N, 2), and its rays."""
+        near, match = same_points(self.pixels, x, radius)
         rays_x, rays_y = (undistorted_rays(self.K, pixels[match], self.k1) for pixels in (x, y))
-        return rho, *inverse_depths(pose.R, pose.t, rays_x, rays_y)
-
-    def _matched(self, x: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Match pixels x (N, 2) with the nearest points: inverse depths and indices into x."""
-        near, match = same_points(self.pixels, x)
-        return self.rho[near], match
+        return self.rho[near], rays_x, rays_y
 
 
-def same_points(pixels: Array, x: Array) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+def same_points(pixels: Array, x: Array, radius: float = _MATCH_RADIUS
+                ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """
     Match pixels (P, 2) of one pair or of landmarks with those of another pair, x (N, 2).
 
@@ -128,6 +158,6 @@ def same_points(pixels: Array, x: Array) -> tuple[NDArray[np.bool_], NDArray[np.
         return np.zeros(len(pixels), bool), np.empty(0, np.int64)
     # Built in half the time of a balanced one, and as fast to query.
     tree = cKDTree(x, balanced_tree=False, compact_nodes=False)
-    distances, match = tree.query(pixels, distance_upper_bound=_MATCH_RADIUS)
+    distances, match = tree.query(pixels, distance_upper_bound=radius)
     near = np.isfinite(distances)
     return near, match[near]

@@ -38,7 +38,7 @@ from djet_ros.core.geometry import (
     sphere_tangents,
     unit,
 )
-from djet_ros.core.jet import Loss
+from djet_ros.core.jet import Loss, robust_scale
 from djet_ros.core.known_depths import KnownDepths, Lengths
 from djet_ros.core.landmark_choice import choose_landmarks
 from djet_ros.core.paraboloid import median
@@ -84,10 +84,17 @@ class WindowTuning:
     negative_parallax: float = 0.01
     # chosen: fewer landmarks do not determine a length
     min_landmarks: int = 8
+    # standard deviations, the usual three, that the median inverse depth of a pair has to exceed
+    depth_over_noise: float = 3.0
     # chosen: relative standard deviations of the length of a pair: from depths around it, and of a
     # guess; landmarks that both frames observe determine it far better
     length_sigma: float = 0.02
     guess_sigma: float = 0.5
+    # chosen: share of the larger image side within which points have about the same depth, and the
+    # relative standard deviation of a length by such neighbours, besides that of its noise: after
+    # a frame between, lengths differed by 1 to 2 % on streets and indoors
+    around: float = 0.05
+    around_sigma: float = 0.1
     # chosen: share of the previous frame's refinement that a step corrects. With all of it the
     # track would jump; with none it would drift twice as much over a hundred frames
     correction_share: float = 0.2
@@ -135,8 +142,15 @@ class Window:
         self._config, self._tuning = config, tuning
         self._distances = DescriptorDistances(config)
 
-    def start(self, view: View, lens: SelfCalibration | None = None) -> None:
-        """Reset everything but the estimate of the lens; this frame is the first."""
+    def start(self, view: View, lens: SelfCalibration | None = None,
+              turn: Array | None = None) -> None:
+        """
+        Reset everything but the estimate of the lens; this frame is the first.
+
+        turn: rotation (3, 3) from the newest frame before, if both were taken at about the same
+        place: depths around its landmarks then give the length of the next pair.
+        """
+        self._scene = None if turn is None else self._scene_after(turn)
         self._K, self._views = view.K, [view]
         self.lens = lens or SelfCalibration.unknown(view.K, view.gray.shape)
         self._poses = Poses(np.eye(3)[None], np.zeros((1, 3)), self.lens.residual_k1)
@@ -177,7 +191,8 @@ class Window:
         self._append(view, relative, length)
         self._add_pair(relative, length, share)
         # Observe old and new landmarks in the frame; then refine all.
-        if self._is_keyframe[-2] and not self._has_landmarks[-2] and relative.t.any():
+        if (self._is_keyframe[-2] and not self._has_landmarks[-2] and relative.t.any()
+                and self.has_depths(relative)):
             self._create_landmarks(relative, length)
         self._observe_landmarks()
         before = self._poses.camera(0)[:3, 3]
@@ -257,7 +272,7 @@ class Window:
         Return the length of the pair and its relative standard deviation.
 
         By landmarks with a match nearby; if too few of them are in view, by the matches of the
-        previous pair.
+        previous pair, and then by matches around landmarks.
         """
         unknown = guess, self._tuning.guess_sigma
         if not relative.t.any():
@@ -266,9 +281,42 @@ class Window:
         if len(lengths.values) < self._tuning.min_landmarks and self._latest is not None:
             lengths = KnownDepths.of_pair(self._K, self._poses.k1, *self._latest).lengths(relative)
         if len(lengths.values) < self._tuning.min_landmarks:
-            return unknown
-        length = lengths.median()
-        return (length, self._tuning.length_sigma) if length > 0 else unknown
+            return self._length_around(self._known_depths(), relative) or unknown
+        return self._determined(lengths, self._tuning.length_sigma) or unknown
+
+    def _scene_after(self, turn: Array) -> KnownDepths | None:
+        """Return the depths around the newest frame as seen after a rotation (3, 3) of it."""
+        scene = self._scene if self.is_new else self._known_depths()
+        if (scene is None or len(scene.rho) < self._tuning.min_landmarks) and self._latest:
+            scene = KnownDepths.of_pair(self._K, self._poses.k1, *self._latest)
+        return None if scene is None else scene.rotated(turn)
+
+    def first_length(self, relative: RelativePose) -> tuple[float, float] | None:
+        """
+        Return the length of a first pair and its relative standard deviation; None if unknown.
+
+        By the depths around the landmarks of the window before: the scene stays where it was.
+        """
+        return None if self._scene is None else self._length_around(self._scene, relative)
+
+    def _length_around(self, known: KnownDepths, relative: RelativePose
+                       ) -> tuple[float, float] | None:
+        """Return the same by points of the neighbourhood, of which the pair may have no match."""
+        return self._determined(
+            known.lengths(relative, self._tuning.around * max(self._views[-1].gray.shape)),
+            self._tuning.around_sigma)
+
+    def _determined(self, lengths: Lengths, share: float) -> tuple[float, float] | None:
+        """
+        Return a length and its relative standard deviation, at least a share.
+
+        None if there are few points, or if a guess is as good.
+        """
+        length = lengths.median() if len(lengths.values) >= self._tuning.min_landmarks else 0.0
+        if length <= 0:
+            return None
+        sigma = float(np.hypot(share, lengths.noise() / length))
+        return (length, sigma) if sigma < self._tuning.guess_sigma else None
 
     def pair_length(self, relative: RelativePose) -> tuple[float, float] | None:
         """
@@ -364,6 +412,18 @@ class Window:
         H = np.zeros_like(self._prior.H)
         H[-12:, -12:] = information
         self._prior.add(H, np.zeros(len(H)), self._poses)
+
+    def has_depths(self, relative: RelativePose) -> bool:
+        """
+        Return whether most depths of a pair with a direction are more than noise of its matches.
+
+        Otherwise landmarks would be those that noise brings nearer: behind the camera, where it
+        brings the others, there are none.
+        """
+        x, y = relative.x[relative.inliers], relative.y_opt[relative.inliers]
+        rho, sigma = inverse_depths(relative.R, relative.t, self._rays(x), self._rays(y))
+        noise = robust_scale(relative.residuals[relative.inliers]) / self._K[0, 0]
+        return bool(median(rho / sigma) > self._tuning.depth_over_noise * noise)
 
     def _create_landmarks(self, relative: RelativePose, length: float) -> None:
         """Create landmarks from the matches of a keyframe with the frame after it."""

@@ -22,8 +22,11 @@ from djet_ros.odometry.scale_filter import ScaleFilter
 import numpy as np
 from scipy.special import bdtr
 
-# Standard deviation of the log factor after an interruption of the track: the camera may continue
-# faster or slower than before.
+# Seconds; chosen: the usual speed is a mean over so long, as single steps may be far off.
+_USUAL_OVER = 0.5
+
+# Standard deviation of the log length of the first step after an interruption of the track, by
+# the usual speed before: the camera may continue faster or slower.
 _INTERRUPTED = 0.5
 
 # Random walk of the log factor in a step, as a share of the standard deviation of the step's
@@ -80,7 +83,7 @@ class TrackScale:
 
     def reset(self) -> None:
         """Forget everything; the next step defines a new unit."""
-        # Units per second of the last step.
+        # Units per second of the last steps.
         self._speed: float | None = None
         self._interrupted = False
         self._filter.reset()
@@ -134,15 +137,17 @@ class TrackScale:
 
     # Lengths
 
-    def begin(self, view: View) -> None:
-        """Begin at a frame without a known motion from the one before: its scale is a guess."""
+    def begin(self, view: View, turn: Array | None = None) -> None:
+        """
+        Begin at a frame without a known motion from the one before: its scale is a guess.
+
+        turn: its rotation (3, 3) from the newest frame of the track, if not much is between them.
+        """
         if not self._uses_landmarks:
             return
-        self._window.start(view, self._lens)
+        self._window.start(view, self._lens, None if self._speed is None else turn)
         self._filter.restart_sum()
-        if self._speed is not None and not self._interrupted:
-            self._filter.add_noise(_INTERRUPTED**2)
-            self._interrupted = True
+        self._interrupted = self._speed is not None
 
     def expected_length(self, span_ns: tuple[int, int]) -> Length:
         """Return the measured length, or that at the last speed, of a pair without an estimate."""
@@ -154,7 +159,8 @@ class TrackScale:
         if not self._uses_landmarks or self._speed is None:
             return None
         usual = self._speed * (span_ns[1] - span_ns[0]) * 1e-9 * self._filter.factor
-        return Length(usual, usual, True, self._filter.metric, False)
+        # An interruption leaves the length of the next step to a guess, which is not metric.
+        return Length(usual, usual, True, self._filter.metric and not self._interrupted, False)
 
     def of_step(self, span_ns: tuple[int, int], current: View, relative: RelativePose) -> Step:
         """
@@ -215,14 +221,16 @@ class TrackScale:
         seconds = (span_ns[1] - span_ns[0]) * 1e-9
         if self._speed is None or not relative.t.any() or not self.agrees(
                 Pose(relative.R, relative.t), relative.x, relative.y_opt):
-            self.begin(current)
+            self.begin(current, motion[:3, :3].T)
         elif (addition := self._added(current, relative, self._speed * seconds)) is not None:
             self._wander(addition, seconds, parallax=True)
             self._window.record_published(motion)
 
     def _added(self, view: View, relative: RelativePose, guess: float) -> WindowStep | None:
         """Add a frame to the window; return None and restart if it has no length."""
-        if not self._window.is_new or relative.t.any():
+        if not self._window.is_new or (relative.t.any() and self._window.has_depths(relative)):
+            if self._interrupted:
+                guess, noise = self._resumed(relative, guess)
             try:
                 addition = self._window.add(view, relative, guess)
             except np.linalg.LinAlgError:
@@ -231,9 +239,26 @@ class TrackScale:
             if self._lens is not None:
                 self._lens = self._window.lens
             if addition is not None and np.isfinite(addition.sigma) and addition.length > 0:
+                if self._interrupted:
+                    self._filter.add_noise(noise**2)
+                    self._interrupted = False
                 return addition
-        self.begin(view)
+        self.begin(view, relative.R)
         return None
+
+    def _resumed(self, relative: RelativePose, usual: float) -> tuple[float, float]:
+        """
+        Return the length of the first pair after an interruption, and its relative noise.
+
+        By the depths of the scene before, and by the usual length: the mean of their logarithms,
+        weighted by their variances.
+        """
+        by_scene = self._window.first_length(relative)
+        if by_scene is None:
+            return usual, _INTERRUPTED
+        lengths, sigmas = np.array([by_scene, (usual, _INTERRUPTED)]).T
+        weights = sigmas**-2 / (sigmas**-2).sum()
+        return float(np.exp(weights @ np.log(lengths))), float((sigmas**-2).sum()**-0.5)
 
     def _wander(self, addition: WindowStep, seconds: float, parallax: bool) -> float:
         """
@@ -242,10 +267,12 @@ class TrackScale:
         A rotation leaves the scale to older landmarks: it wanders by the standard deviation of the
         camera's position, over a usual step.
         """
-        own, self._interrupted = min(addition.sigma / addition.length, 1.0), False
-        usual = addition.length
-        if parallax or self._speed is None:
+        own, usual = min(addition.sigma / addition.length, 1.0), addition.length
+        if self._speed is None:
             self._speed = addition.length / seconds
+        elif parallax:
+            share = 1 - np.exp(-seconds / _USUAL_OVER)
+            self._speed += share * (addition.length / seconds - self._speed)
         else:
             usual = max(usual, self._speed * seconds)
         self._filter.add_noise((_WANDERING * min(addition.sigma / usual, 1.0))**2)
