@@ -20,6 +20,10 @@ PYTHON ?= $(shell for python in python3.12 python3.11 python3.13 python3; do \
 	$$python -c 'import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))' \
 	2>/dev/null && echo $$python && break; done)
 
+# Where this is set, as in many containers, every process that a test starts would compile all
+# modules of the package anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test lint lowest fuzz audit results recorded pages clean
 
 demo: $(VENV)/.installed
