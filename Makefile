@@ -10,6 +10,8 @@ REAL_FRAMES ?=
 ONLY ?=
 TABLES ?= dds soak outvoted links loops 'live loops' 'camera height' 'short ways' coverage
 SEEDS ?= 0,1,2,3,4
+# linters and tests share an environment: each installation compiles the loops anew
+TOOLS := $(VENV)/.installed-lint,peers,test
 # what an installation is made of, beside what it finds in place
 BUILT := setup.py $(wildcard djet_ros/compiled/*.[ch])
 # in the order of their names: files of few tests, some of them long, would come last
@@ -24,15 +26,15 @@ PYTHON ?= $(shell for python in python3.12 python3.11 python3.13 python3; do \
 # modules of the package anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test lint lowest fuzz audit results recorded pages clean
+.PHONY: demo test lint lowest fuzz audit results recorded pages installed installed-lowest clean
 
 demo: $(VENV)/.installed
 	$(VENV)/bin/djet demo $(if $(SEQUENCE),'$(SEQUENCE)') --output demo --overwrite
 
-test: $(VENV)/.installed-test,peers
+test: $(TOOLS)
 	$(VENV)/bin/$(PYTEST)
 
-lint: $(VENV)/.installed-lint
+lint: $(TOOLS)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/flake8
 	$(VENV)/bin/mypy
@@ -41,6 +43,10 @@ lint: $(VENV)/.installed-lint
 # compiled loops, decoding, bags, parameters, replay, live session; all others are marked slow
 lowest: $(LOWEST)/.installed-test
 	$(LOWEST)/bin/$(PYTEST) -m 'not slow'
+
+# the environments alone, for .ci/run
+installed: $(TOOLS)
+installed-lowest: $(LOWEST)/.installed-test
 
 # everything that reads what strangers made, for FUZZ_SECONDS each
 fuzz: $(VENV)/.installed-fuzz
@@ -52,19 +58,19 @@ audit: $(AUDIT)/.installed
 
 # the figures of doc/results.md and the README's table; a broken run is taken up where it ended;
 # ONLY adds parts to what the same settings and code gave
-results: $(VENV)/.installed-test,peers
+results: $(TOOLS)
 	$(VENV)/bin/python doc/measure.py --frames $(FRAMES) --seeds $(SEEDS) \
 		$(if $(REAL_FRAMES),--real-frames $(REAL_FRAMES)) $(if $(ONLY),--only '$(ONLY)')
 	$(VENV)/bin/python doc/pages.py
 
 # tables beside those: TABLES of node, dds, soak, outvoted, links, loops, 'live loops',
 # 'camera height', 'short ways' and coverage
-recorded: $(VENV)/.installed-test,peers
+recorded: $(TOOLS)
 	$(VENV)/bin/python doc/record.py $(TABLES)
 	$(VENV)/bin/python doc/pages.py
 
 # what stands between generated marks in the README and in doc/
-pages: $(VENV)/.installed-test,peers
+pages: $(TOOLS)
 	$(VENV)/bin/python doc/pages.py
 
 clean:
