@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterable, Iterator
+from functools import cache
 from importlib.metadata import requires
 from pathlib import Path
 import re
@@ -39,8 +40,11 @@ def dotted(path: Path) -> str:
     return '.'.join(path.relative_to(PACKAGE.parent).with_suffix('').parts)
 
 
-TREES = {dotted(path): ast.parse(path.read_text(), path)
-         for path in sorted(PACKAGE.rglob('*.py'))}
+@cache
+def trees() -> dict[str, ast.Module]:
+    """Parse all modules; not at import, which every worker does."""
+    return {dotted(path): ast.parse(path.read_text(), path)
+            for path in sorted(PACKAGE.rglob('*.py'))}
 
 
 def room(module: str) -> str:
@@ -59,12 +63,15 @@ def imported(tree: ast.AST) -> Iterator[str]:
             yield from (f'{node.module}.{alias.name}' for alias in node.names)
 
 
-IMPORTS: Imports = {module: set(imported(tree)) for module, tree in TREES.items()}
+@cache
+def all_imports() -> Imports:
+    """Return what each module imports."""
+    return {module: set(imported(tree)) for module, tree in trees().items()}
 
 
 def libraries(module: str) -> set[str]:
     """Top-level packages that a module imports from."""
-    return {name.partition('.')[0] for name in IMPORTS[module]}
+    return {name.partition('.')[0] for name in all_imports()[module]}
 
 
 def upward(imports: Imports) -> set[tuple[str, str]]:
@@ -99,7 +106,7 @@ def cycle(imports: Imports) -> list[str]:
 
 def planted(module: str, name: str) -> Imports:
     """Return the imports as they would be with one more."""
-    return {**IMPORTS, module: IMPORTS[module] | {name}}
+    return {**all_imports(), module: all_imports()[module] | {name}}
 
 
 def test_every_package_has_its_place_in_the_order() -> None:
@@ -109,7 +116,7 @@ def test_every_package_has_its_place_in_the_order() -> None:
 
 
 def test_no_module_imports_from_a_package_above_or_next_to_its_own() -> None:
-    assert not upward(IMPORTS)
+    assert not upward(all_imports())
 
 
 @pytest.mark.parametrize(('module', 'name'), [
@@ -123,7 +130,7 @@ def test_an_upward_import_is_detected(module: str, name: str) -> None:
 
 
 def test_no_modules_import_one_another_in_a_cycle() -> None:
-    assert not cycle(IMPORTS)
+    assert not cycle(all_imports())
 
 
 def test_a_cycle_of_imports_is_detected() -> None:
@@ -133,25 +140,25 @@ def test_a_cycle_of_imports_is_detected() -> None:
 
 
 def in_room(name: str) -> Iterable[str]:
-    return (module for module in TREES if module.split('.')[1] == name)
+    return (module for module in trees() if module.split('.')[1] == name)
 
 
 def test_the_core_uses_arrays_and_no_files_threads_or_terminals() -> None:
     for module in in_room('core'):
         assert libraries(module) <= (sys.stdlib_module_names - OUTSIDE_WORLD) | CORE_LIBRARIES
-        called = {node.func.id for node in ast.walk(TREES[module])
+        called = {node.func.id for node in ast.walk(trees()[module])
                   if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}
         assert not called & OUTSIDE_CALLS, module
 
 
 def test_packages_of_ros_are_imported_by_the_ros_package_only() -> None:
-    users = {module for module in TREES if libraries(module) & ROS_LIBRARIES}
+    users = {module for module in trees() if libraries(module) & ROS_LIBRARIES}
     assert users
     assert users <= set(in_room('ros'))
 
 
 def test_a_missing_module_of_ros_names_the_package_in_package_xml() -> None:
-    asked = {node.args[1].value for node in ast.walk(TREES['djet_ros.ros.parameters'])
+    asked = {node.args[1].value for node in ast.walk(trees()['djet_ros.ros.parameters'])
              if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
              and node.func.id == '_require' and isinstance(node.args[1], ast.Constant)}
     assert asked == {'tf2-msgs', 'tf2-ros-py'}
@@ -179,7 +186,7 @@ def test_every_library_is_a_declared_dependency() -> None:
                 if not re.search(r'extra == .(test|lint)', line)}
     # Python 3.14 has zstd.
     known = sys.stdlib_module_names | {'compression', 'djet_ros'} | ROS_LIBRARIES
-    undeclared = {(module, library) for module in TREES for library in libraries(module) - known
+    undeclared = {(module, library) for module in trees() for library in libraries(module) - known
                   if name_of(REQUIREMENTS.get(library, library)) not in declared}
     assert not undeclared
 
