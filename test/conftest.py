@@ -13,6 +13,10 @@ ROOT = Path(__file__).resolve().parent.parent
 def pytest_configure() -> None:
     """Use one thread a process, set before NumPy is imported: tests run in parallel."""
     one_blas_thread()
+    from hypothesis import settings
+    # Hypothesis' deadline of 200 ms an example is missed where others use the cores too.
+    settings.register_profile('no deadline', deadline=None)
+    settings.load_profile('no deadline')
 
 
 @pytest.fixture(scope='session')
