@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 import os
 from pathlib import Path
@@ -384,11 +384,17 @@ def apart_by(one: OdometryResult, other: OdometryResult) -> float:
     return float(np.sqrt(step @ np.linalg.solve(other.motion_covariance, step)))
 
 
+@cache
+def rendered(name: str) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return the images of a scene, and K."""
+    made = make_scene(name, seed=0, size=(416, 256))
+    return [made.render(pose, i) for i, pose in enumerate(made.trajectory(8))], made.K
+
+
 @pytest.fixture(params=['road', 'handheld'])
 def frames(request: pytest.FixtureRequest) -> list[Frame]:
-    rendered = make_scene(request.param, seed=0, size=(416, 256))
-    return [Frame(rendered.render(pose, i), rendered.K, 10**8 * (i + 1))
-            for i, pose in enumerate(rendered.trajectory(8))]
+    images, K = rendered(request.param)
+    return [Frame(gray, K, 10**8 * (i + 1)) for i, gray in enumerate(images)]
 
 
 @pytest.mark.parametrize('name', ['best', 'fast', 'paper'])
