@@ -378,8 +378,7 @@ def test_plot_works_for_any_recording_name(folder, tmp_path, name):
     source, results = (Path(os.fsdecode(os.fsencode(tmp_path) + b'/' + word))
                        for word in (name, b'of ' + name))
     source.symlink_to(folder)
-    done = djet_alone('replay', source, '--output', results, '--preset', 'fast',
-                      PYTHONIOENCODING='utf-8:strict')
+    done = djet('replay', source, '--output', results, '--preset', 'fast')
     assert (done.returncode, done.stderr) == (0, '')
     assert (results / 'trajectory.png').exists()
 
