@@ -243,6 +243,22 @@ def test_yaml_aliases_are_read(tmp_path):
     assert load_yaml(written(tmp_path, text)).odometry.max_lost == 7
 
 
+@pytest.mark.parametrize(('text', 'message'), [
+    ('odometry: {max_lost: 7}\nros:\nodometry: {max_gap: 2}', "'odometry' .* lines 1 and 3"),
+    ('odometry:\n  max_lost: 7\n  max_lost: 8', "'max_lost' .* lines 2 and 3"),
+    ('{odometry: {max_lost: 7, max_lost: 8}}', "'max_lost' .* lines 1 and 1")])
+def test_a_key_that_stands_twice_is_refused_with_its_lines(tmp_path, text, message):
+    with pytest.raises(DjetError, match=f'is not valid YAML: {message}; join the two'):
+        load_yaml(written(tmp_path, text))
+
+
+def test_what_a_mapping_merges_may_be_overridden(tmp_path):
+    text = ('odometry: &one {max_lost: 7, max_gap: 2}\n'
+            'vo_node: {ros__parameters: {odometry: {<<: *one, max_gap: 3}}}')
+    config = load_yaml(written(tmp_path, text)).odometry
+    assert (config.max_lost, config.max_gap) == (7, 3)
+
+
 @pytest.mark.parametrize('value', ['!!bool so', '!!int ""', '!!float ""', '!!timestamp soon',
                                    '\x01', '2001-01-01 00:00:00 +99:99'])
 def test_values_that_crash_the_yaml_library_are_refused_in_one_line(tmp_path, value):

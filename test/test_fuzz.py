@@ -62,5 +62,5 @@ def test_only_safe_loading_and_no_code_from_data():
                 assert not [word for word in node.keywords if word.arg in ('allow_pickle', 'shell')
                             and ast.unparse(word.value) != 'False'], where
             elif isinstance(node, ast.Attribute) and ast.unparse(node.value) == 'yaml':
-                assert node.attr in ('SafeLoader', 'YAMLError', 'CollectionNode',
-                                     'safe_dump'), where
+                assert node.attr in ('SafeLoader', 'YAMLError', 'CollectionNode', 'MappingNode',
+                                     'ScalarNode', 'safe_dump'), where

@@ -69,6 +69,8 @@ def _expanded_size(node: Any, known: dict[int, int]) -> int:
         return known[id(node)]
     known[id(node)] = 0
     count = 1
+    if isinstance(node, yaml.MappingNode):
+        _refuse_repeated_keys(node)
     if isinstance(node, yaml.CollectionNode):
         for item in node.value:
             count += sum(_expanded_size(part, known)
@@ -77,3 +79,16 @@ def _expanded_size(node: Any, known: dict[int, int]) -> int:
         raise yaml.YAMLError(f'its aliases expand to more than {LARGEST_YAML} values')
     known[id(node)] = count
     return count
+
+
+def _refuse_repeated_keys(node: yaml.MappingNode) -> None:
+    """Raise YAMLError if a key stands twice: PyYAML would drop the first value without a word."""
+    lines: dict[tuple[str, str], int] = {}
+    for key, _ in node.value:
+        # A merge (<<) may be repeated.
+        if isinstance(key, yaml.ScalarNode) and key.tag != 'tag:yaml.org,2002:merge':
+            name, line = (key.tag, key.value), key.start_mark.line + 1
+            if name in lines:
+                raise yaml.YAMLError(f"'{key.value[:80]}' stands twice in one mapping, in lines "
+                                     f'{lines[name]} and {line}; join the two')
+            lines[name] = line
