@@ -243,6 +243,11 @@ def test_yaml_aliases_are_read(tmp_path):
     assert load_yaml(written(tmp_path, text)).odometry.max_lost == 7
 
 
+def test_an_integer_that_would_take_minutes_is_refused(tmp_path):
+    with pytest.raises(DjetError, match='it has an integer of 399999 characters'):
+        load_yaml(written(tmp_path, f'a: {":".join(["1"] * 200_000)}'))
+
+
 @pytest.mark.parametrize(('text', 'message'), [
     ('odometry: {max_lost: 7}\nros:\nodometry: {max_gap: 2}', "'odometry' .* lines 1 and 3"),
     ('odometry:\n  max_lost: 7\n  max_lost: 8', "'max_lost' .* lines 2 and 3"),

@@ -16,6 +16,9 @@ LARGEST_TEXT = 64 << 20
 # nesting.
 LARGEST_YAML = 2 << 20
 
+# Characters. PyYAML's time for 1:59:59:..., an integer to the base of 60, grows with their square.
+_LONGEST_INTEGER = 1000
+
 # The first line of OpenCV's files looks like a YAML directive but is not a valid one.
 _OPENCV_HEADER = re.compile(r'\A\ufeff?%YAML:\d[^\n]*')
 
@@ -61,7 +64,8 @@ def _expanded_size(node: Any, known: dict[int, int]) -> int:
     """
     Return the number of values below a node with aliases expanded.
 
-    A few lines of nested aliases ("billion laughs") can expand beyond any memory: YAMLError.
+    A few lines of nested aliases ("billion laughs") can expand beyond any memory: YAMLError, as
+    for other nodes that must not be constructed.
     """
     if id(node) in known:
         if not known[id(node)]:
@@ -71,6 +75,9 @@ def _expanded_size(node: Any, known: dict[int, int]) -> int:
     count = 1
     if isinstance(node, yaml.MappingNode):
         _refuse_repeated_keys(node)
+    elif node is not None and node.tag == 'tag:yaml.org,2002:int' \
+            and len(node.value) > _LONGEST_INTEGER:
+        raise yaml.YAMLError(f'it has an integer of {len(node.value)} characters')
     if isinstance(node, yaml.CollectionNode):
         for item in node.value:
             count += sum(_expanded_size(part, known)
