@@ -667,6 +667,23 @@ def test_a_bag_that_lost_only_its_index_has_lost_nothing(whole, tmp_path, suffix
     assert keys(delivered) == keys(read_until_broken(whole[suffix])[0])
 
 
+@pytest.mark.parametrize('declared', ['none', 'absurd'])
+def test_wrong_counts_in_an_mcap_are_those_of_its_messages(whole, tmp_path, declared):
+    data = bytearray(whole['mcap'].read_bytes())
+    # The statistics: 46 bytes, then (channel, count) of each of the two channels.
+    begin = data.rindex(struct.pack('<BQ', 0x0B, 46 + 2 * 10)) + 9 + 42
+    if declared == 'none':
+        # As the format allows: the counts are not known.
+        struct.pack_into('<I', data, begin, 0)
+    else:
+        struct.pack_into('<Q', data, begin + 4 + 2, 2**63)
+    path = tmp_path / 'wrong.mcap'
+    path.write_bytes(data)
+    with Bag(path) as bag, Bag(whole['mcap']) as right:
+        assert bag.topics == right.topics
+    assert keys(read_until_broken(path)[0]) == keys(read_until_broken(whole['mcap'])[0])
+
+
 def test_a_compressed_chunk_cut_short_gives_its_first_messages(tmp_path):
     path = record(tmp_path / 'bag', camera_messages(200), mode=CompressionMode.STORAGE)
     data = (path / 'bag.mcap').read_bytes()

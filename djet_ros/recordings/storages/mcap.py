@@ -81,8 +81,10 @@ class McapFile(ChunkedFile):
                 total, schemas, channels = fields.unpack('<QHI')
                 fields.unpack('<IIIQQ')
                 self._counts = Counter(dict(struct.iter_unpack('<HQ', fields.blob(multiple=10))))
+        # The file has an entry for each message, and may leave out the counts by channel.
         return ((total, schemas, channels)
-                == (indexed, len(self._schemas), len(self._channels)))
+                == (indexed, len(self._schemas), len(self._channels))
+                and total == self._counts.total() <= self.size)
 
     def _scan_records(self, file: BinaryIO) -> None:
         self._schemas.clear()
