@@ -39,7 +39,7 @@ from djet_ros.recordings.mask_files import static_mask
 from djet_ros.recordings.recording import BagRecording
 from djet_ros.recordings.storages import BrokenFile, Connection
 from djet_ros.recordings.trajectories import KittiWriter, read_tum, TumWriter
-from djet_ros.recordings.varos import VarosSequence
+from djet_ros.recordings.varos import varos
 from djet_ros.replay.graph_of_results import read_results
 import numpy as np
 from ros_messages import camera_info, compressed, header, image, roi, serialised
@@ -643,6 +643,10 @@ FRAMES_OF_RESULTS = (
     b'2,3000000000,OK,,2000000000,9,9,0,2,0.1,9.0,1.0,metric,1.00\n')
 
 
+def varos_in(place: Path) -> FrameSequence:
+    return varos(place / 'vehicle0' / 'cam0', place.name)
+
+
 def sequence_target(build: Callable[[Path], None], file: str,
                     opener: Callable[[Path], object]) -> Target:
     sequence = Sequence(build, file, opener)
@@ -695,8 +699,8 @@ TARGETS: dict[str, Target] = {
     'kitti_raw_oxts_clock': sequence_target(kitti_raw_folder, 'oxts/timestamps.txt', kitti_raw),
     'mask_file': Target(mask_seeds, mask_of),
     'varos_stamps': sequence_target(
-        varos_folder, 'vehicle0/cam0/camM0_timestamps.csv', VarosSequence),
+        varos_folder, 'vehicle0/cam0/camM0_timestamps.csv', varos_in),
     'varos_truth': sequence_target(
         varos_folder, 'vehicle0/cam0/camM0_poses/camM0_poses_transformation_matrix.csv',
-        VarosSequence),
+        varos_in),
 }

@@ -36,7 +36,7 @@ from djet_ros.recordings.text import (
     whole_nanoseconds,
 )
 from djet_ros.recordings.trajectories import poses_from_quaternions, read_tum
-from djet_ros.recordings.varos import varos_camera, VarosSequence
+from djet_ros.recordings.varos import varos, varos_camera
 import numpy as np
 from numpy.typing import NDArray
 
@@ -153,8 +153,8 @@ def open_sequence(path: Path, own_poses: bool = True) -> FrameSequence:
     """
     if (path / 'rgb.txt').exists():
         return tum_rgbd(path)
-    if varos_camera(path) is not None:
-        return VarosSequence(path)
+    if (camera := varos_camera(path)) is not None:
+        return varos(camera, path.resolve().name)
     if (path / 'mav0').is_dir() or (path / 'cam0').is_dir():
         return euroc(path)
     if is_kitti_raw(path):

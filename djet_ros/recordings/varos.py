@@ -15,7 +15,7 @@ from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.recordings.frame_sequence import FrameSequence, from_first, ImageFiles
 from djet_ros.recordings.kitti import check_rigid, STAMP_OFFSET_NS
-from djet_ros.recordings.text import increasing, lines, number_rows, stamped, whole_nanoseconds
+from djet_ros.recordings.text import increasing, lines, stamped, stamped_rows, whole_nanoseconds
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,32 +24,25 @@ FOCAL_LENGTH = 990.323
 SIZE = (1280, 720)
 
 
-class VarosSequence(FrameSequence):
+def varos(camera: Path, name: str) -> FrameSequence:
     """
-    A folder of VAROS: the recording, its vehicle0, or its cam0.
+    Open cam0 of a recording of VAROS, see ``varos_camera``; name: of the recording.
 
     Stamps are those of the data set plus STAMP_OFFSET_NS. An image has ground truth if a pose has
     the same stamp. Raises DjetError if the folder does not have this layout.
     """
-
-    def __init__(self, folder: Path) -> None:
-        """Read everything but the images, and check its consistency."""
-        camera = varos_camera(folder)
-        if camera is None:
-            raise DjetError(f'{folder} is no VAROS folder; it must hold vehicle0/cam0')
-        images = ImageFiles(sorted((camera / 'A').glob('*.png')))
-        if images.size != SIZE:
-            raise DjetError(f'{camera / "A"} has images of {images.size[0]}x{images.size[1]}, but '
-                            f'the calibration of VAROS is for {SIZE[0]}x{SIZE[1]}')
-        K = np.array([[FOCAL_LENGTH, 0, (SIZE[0] - 1) / 2],
-                      [0, FOCAL_LENGTH, (SIZE[1] - 1) / 2], [0, 0, 1]])
-        stamps = _stamps(camera / 'camM0_timestamps.csv')
-        if len(stamps) != len(images.paths):
-            raise DjetError(f'{camera / "camM0_timestamps.csv"} has {len(stamps)} rows for '
-                            f'{len(images.paths)} images; there must be one per image')
-        poses = _poses(camera / 'camM0_poses' / 'camM0_poses_transformation_matrix.csv', stamps)
-        super().__init__(f'VAROS {folder.resolve().name}', images, K, stamps + STAMP_OFFSET_NS,
-                         poses)
+    images = ImageFiles(sorted((camera / 'A').glob('*.png')))
+    if images.size != SIZE:
+        raise DjetError(f'{camera / "A"} has images of {images.size[0]}x{images.size[1]}, but the '
+                        f'calibration of VAROS is for {SIZE[0]}x{SIZE[1]}')
+    K = np.array([[FOCAL_LENGTH, 0, (SIZE[0] - 1) / 2],
+                  [0, FOCAL_LENGTH, (SIZE[1] - 1) / 2], [0, 0, 1]])
+    stamps = _stamps(camera / 'camM0_timestamps.csv')
+    if len(stamps) != len(images.paths):
+        raise DjetError(f'{camera / "camM0_timestamps.csv"} has {len(stamps)} rows for '
+                        f'{len(images.paths)} images; there must be one per image')
+    poses = _poses(camera / 'camM0_poses' / 'camM0_poses_transformation_matrix.csv', stamps)
+    return FrameSequence(f'VAROS {name}', images, K, stamps + STAMP_OFFSET_NS, poses)
 
 
 def varos_camera(folder: Path) -> Path | None:
@@ -70,8 +63,8 @@ def _poses(path: Path, stamps: NDArray[np.int64]) -> Array | None:
     """Return poses (N, 4, 4) at stamps (N,), relative to the first known; NaN if unknown."""
     if not path.exists():
         return None
-    rows = number_rows(path, 13)
-    known = dict(zip(rows[:, 0].astype(np.int64).tolist(), rows[:, 1:].reshape(-1, 3, 4)))
+    at, rows = stamped_rows(path, 13, whole_nanoseconds)
+    known = dict(zip(at.tolist(), rows.reshape(-1, 3, 4)))
     poses = np.full((len(stamps), 4, 4), np.nan)
     for index, stamp in enumerate(stamps.tolist()):
         if stamp in known:
