@@ -392,6 +392,20 @@ def test_a_raw_drive_of_kitti_is_read_as_published(raw: Path) -> None:
     assert np.allclose(sequence.imu.to_camera @ sequence.imu.rates[0], [-0.02, -0.1, 0.01])
 
 
+def test_packets_of_the_gps_may_be_in_any_order(raw: Path) -> None:
+    before = open_sequence(raw)
+    data, stamps = raw / 'oxts' / 'data', raw / 'oxts' / 'timestamps.txt'
+    order = (0, 2, 1, 3, 3)
+    packets = [(data / f'{i:010d}.txt').read_text() for i in order]
+    for i, packet in enumerate(packets):
+        (data / f'{i:010d}.txt').write_text(packet)
+    clock = stamps.read_text().splitlines(keepends=True)
+    stamps.write_text(''.join(clock[i] for i in order))
+    after = open_sequence(raw)
+    assert np.array_equal(after.poses, before.poses)
+    assert np.array_equal(after.imu.stamps_ns, before.imu.stamps_ns)
+
+
 def test_a_raw_drive_needs_no_gps(raw: Path) -> None:
     shutil.rmtree(raw / 'oxts')
     sequence = open_sequence(raw)

@@ -67,10 +67,9 @@ def kitti_raw(folder: Path) -> FrameSequence:
     poses = imu = None
     if (unit_in_camera := _unit_in_camera(folder, rectifying)) is not None:
         known, rows = _oxts(folder / 'oxts')
-        if (np.diff(known) > 0).all():
-            units = _unit_poses(rows, folder)
-            poses = from_first(poses_at(known, units @ np.linalg.inv(unit_in_camera), stamps,
-                                        _LONGEST_GAP_NS))
+        units = _unit_poses(rows, folder)
+        poses = from_first(poses_at(known, units @ np.linalg.inv(unit_in_camera), stamps,
+                                    _LONGEST_GAP_NS))
         imu = ImuTrack(known, rows[:, _RATES], rows[:, _ACCELERATIONS], unit_in_camera[:3, :3])
     return FrameSequence(f'KITTI raw {folder.resolve().name}', images, K, stamps, poses,
                          distortion.tolist(), imu=imu)
@@ -171,7 +170,7 @@ def _unit_in_camera(folder: Path, rectifying: Array) -> Array | None:
 
 
 def _oxts(folder: Path) -> tuple[NDArray[np.int64], Array]:
-    """Return stamps (M,) and rows (M, 30) of the GPS/IMU."""
+    """Return increasing stamps (M,) and rows (M, 30) of the GPS/IMU."""
     stamps = _stamps(folder / 'timestamps.txt')
     paths = sorted((folder / 'data').glob('*.txt'))
     if len(stamps) != len(paths):
@@ -181,7 +180,9 @@ def _oxts(folder: Path) -> tuple[NDArray[np.int64], Array]:
     wrong = next((path for path, row in zip(paths, rows, strict=True) if len(row) != 1), None)
     if wrong is not None:
         raise DjetError(f'{wrong} must have exactly one line of {_COLUMNS} numbers')
-    return stamps, np.concatenate(rows) if rows else np.empty((0, _COLUMNS))
+    # In unsynchronised drives some packets were stamped in another order, or at one time.
+    stamps, first = np.unique(stamps, return_index=True)
+    return stamps, np.concatenate(rows)[first] if rows else np.empty((0, _COLUMNS))
 
 
 def _unit_poses(rows: Array, folder: Path) -> Array:
