@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -104,12 +105,12 @@ def split(text: str) -> list[str]:
 
 
 def numbers(text: str, option: str, form: str) -> list[float]:
-    """Return the numbers of a list in a form such as X,Y; raise DjetError if it has another."""
+    """Return the finite numbers of a list in a form such as X,Y; raise DjetError otherwise."""
     try:
         values = [float(word) for word in split(text)]
     except ValueError:
         values = []
-    if len(values) != len(split(form)):
+    if len(values) != len(split(form)) or not all(map(math.isfinite, values)):
         raise DjetError(f"{option} is '{text}'; write it as {form}")
     return values
 

@@ -78,7 +78,7 @@ def _images(args: argparse.Namespace) -> tuple[NDArray[np.uint8], NDArray[np.uin
     if args.camera is None:
         raise DjetError('two images need --camera FX,FY,CX,CY')
     fx, fy, cx, cy = numbers(args.camera, '--camera', 'FX,FY,CX,CY')
-    if not (fx > 0 and fy > 0 and np.isfinite([fx, fy, cx, cy]).all()):
+    if min(fx, fy) <= 0:
         raise DjetError(f"--camera is '{args.camera}'; focal lengths must be positive numbers")
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
     return read_image(args.source), read_image(args.other), K
