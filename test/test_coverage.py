@@ -155,6 +155,9 @@ def test_the_command_renders_measures_and_resumes(tmp_path: Path) -> None:
     ((), 'nothing to measure'), (('--scenes', 'moon'), "'moon'"),
     (('--scenes', 'road', '--seeds', 'x'), "'x'"),
     (('--scenes', 'road', '--seeds', '5-3'), "'5-3'"),
+    (('--scenes', 'road', '--seeds', '1-2-3'), "'1-2-3'"),
+    (('--scenes', 'road', '--seeds', '0-3,2'), "'0-3,2' is not a list of different seeds"),
+    (('--scenes', 'road,blur,road'), "scene 'road' is given twice"),
     (('--scenes', 'road', '--frames', 1), '--frames is 1'), (('nowhere',), 'nowhere')])
 def test_user_errors_are_one_line_and_exit_code_2(
         tmp_path: Path, arguments: tuple[object, ...], message: str) -> None:

@@ -113,7 +113,8 @@ def test_the_command_runs_each_trial_with_all_inputs_and_resumes(
 
 
 @pytest.mark.parametrize(('arguments', 'output'), [
-    (('--trials', 'moon'), "'moon'"), (('--frames', '2'), '--frames is 2'),
+    (('--trials', 'moon'), "'moon'"), (('--trials', 'whip,whip'), "'whip' is given twice"),
+    (('--trials', ','), 'no trial is given'), (('--frames', '2'), '--frames is 2'),
     (('--workers', '0'), 'workers is 0')])
 def test_user_errors_are_one_line_and_exit_code_2(
         tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...],

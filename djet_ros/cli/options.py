@@ -122,11 +122,13 @@ def add_seeds(parser: argparse.ArgumentParser) -> None:
 
 
 def _seeds(text: str) -> list[int]:
-    """Return the numbers of a text such as 0,3-5."""
+    """Return the numbers of a text such as 0,3-5, each of which may be named once."""
     try:
-        ends = [[int(end) for end in part.split('-')] for part in split(text)]
+        ends = [[int(end) for end in part.split('-', 1)] for part in split(text)]
     except ValueError:
         ends = []
-    if not ends or any(end[0] > end[-1] for end in ends):
-        raise argparse.ArgumentTypeError(f"'{text}' is not a list of seeds such as 0,3 or 0-9")
-    return [seed for end in ends for seed in range(end[0], end[-1] + 1)]
+    seeds = [seed for end in ends for seed in range(end[0], end[-1] + 1)]
+    if not seeds or any(end[0] > end[-1] for end in ends) or len(set(seeds)) < len(seeds):
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is not a list of different seeds such as 0,3 or 0-9")
+    return seeds

@@ -24,6 +24,7 @@ from djet_ros.lab.beside import (
     TrialChunk,
     TRIALS,
 )
+from djet_ros.lab.methods import check_names
 from djet_ros.lab.pairs import FAILURE
 from djet_ros.recordings.outputs import make_folder, write_whole
 import numpy as np
@@ -55,8 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run all trials, and print the errors."""
     trials = split(args.trials)
-    if unknown := [name for name in trials if name not in TRIALS]:
-        raise DjetError(f"--trials has '{unknown[0]}'; choose from {', '.join(TRIALS)}")
+    check_names('trial', trials, TRIALS)
     check_workers(args)
     if args.frames < 3:
         raise DjetError(f'--frames is {args.frames}; it must be at least 3')

@@ -39,6 +39,7 @@ from djet_ros.lab.coverage import (
     SURE_DIRECTION,
     SURE_ROTATION,
 )
+from djet_ros.lab.methods import check_names
 from djet_ros.lab.pairs import FAILURE
 from djet_ros.lab.runner import chunks_of, local_workers, run as run_chunks
 from djet_ros.lab.scenes import render_sequence, SCENES
@@ -73,8 +74,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Render missing scenes, estimate all pairs, and print the coverage."""
     scenes = list(SCENES) if args.scenes == 'all' else split(args.scenes)
-    if unknown := [name for name in scenes if name not in SCENES]:
-        raise DjetError(f"--scenes has '{unknown[0]}'; choose from {', '.join(SCENES)}, or all")
+    if scenes:
+        check_names('scene', scenes, SCENES)
     check_workers(args)
     if args.frames < 2:
         raise DjetError(f'--frames is {args.frames}; it must be at least 2')
