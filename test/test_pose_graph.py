@@ -178,6 +178,7 @@ def test_other_folders_and_damaged_results_are_refused(results, tmp_path):
         read_results(tmp_path)
     for name, damage, error_text in (
             ('frames.csv', lambda text: text.replace('OK', 'SPLENDID', 1), 'line 3'),
+            ('frames.csv', lambda text: f'{text}0,"{"x" * 200_000}\n', 'larger than field limit'),
             ('frames.csv', lambda text: text.replace('1100000000', '1100000001'), 'same run'),
             ('trajectory_tum.txt', lambda text: 'x' + text, 'not a number')):
         folder = tmp_path / f'damaged {error_text}'

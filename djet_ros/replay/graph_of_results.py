@@ -82,9 +82,9 @@ class _Row(NamedTuple):
 
 def _rows(path: Path) -> list[_Row]:
     """Return the rows of frames.csv that were processed."""
-    rows = []
-    for number, row in enumerate(csv.DictReader(io.StringIO(read_text(path))), 2):
-        try:
+    rows, reader = [], csv.DictReader(io.StringIO(read_text(path)))
+    try:
+        for row in reader:
             if row['status'] == 'UNUSED':
                 continue
             previous = row['previous_stamp_ns']
@@ -92,8 +92,9 @@ def _rows(path: Path) -> list[_Row]:
                              int(previous) if previous else None,
                              Scale(row['scale_kind'] or Scale.UNKNOWN),
                              IS_KEYFRAME[row.get('keyframe') or ''], k1_of(row.get('k1'))))
-        except (KeyError, TypeError, ValueError) as error:
-            raise DjetError(f'{path} line {number} is not a row of a replay: {error}') from error
+    except (csv.Error, KeyError, TypeError, ValueError) as error:
+        raise DjetError(f'{path} line {reader.line_num} is not a row of a replay: '
+                        f'{error}') from error
     return rows
 
 
