@@ -13,6 +13,8 @@ from djet_ros.lab.imu_offset import fit_imu, VisualRotations
 from djet_ros.lab.scenes.imu import feel, Mems, TO_CAMERA
 from djet_ros.lab.scenes.sequence import render_sequence
 from djet_ros.lab.scenes.walk import HandHeld
+from djet_ros.recordings.bag_writers import ResultBag
+from djet_ros.recordings.decoding import MAKE
 import numpy as np
 import pytest
 
@@ -83,3 +85,21 @@ def test_a_recording_without_an_imu_is_named(
         small_kitti: object, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['lab', 'imu-offset', str(small_kitti())]) == 2  # type: ignore[operator]
     assert 'holds no IMU data' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(('focal', 'reason'), [
+    (0.0, 'CameraInfo k is all zeros: the camera is not calibrated'),
+    (50.0, '0 pairs whose angular rates vary by 0.000 rad/s')])
+def test_a_recording_without_a_pair_is_told_the_reason(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str], focal: float, reason: str) -> None:
+    K = np.array([[focal, 0, focal], [0, focal, focal], [0, 0, focal > 0]])
+    with ResultBag(tmp_path / 'bag') as bag:
+        for stamp in range(PERIOD, 4 * PERIOD, PERIOD):
+            for topic, message in (
+                    ('/imu', MAKE.imu(stamp, 'imu', np.zeros(3), np.zeros(3))),
+                    ('/camera_info', MAKE.camera_info(stamp, 'camera', K, (100, 100))),
+                    ('/image_raw', MAKE.picture(stamp, 'camera', np.zeros((100, 100), np.uint8)))):
+                bag.write(topic, message, stamp)
+    assert main(['lab', 'imu-offset', str(tmp_path / 'bag')]) == 2
+    error = capsys.readouterr().err
+    assert reason in error and error.count('\n') == 1

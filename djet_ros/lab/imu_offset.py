@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
+from djet_ros.config.sections import Config
 from djet_ros.core.geometry import rotation_log
-from djet_ros.core.types import Array
+from djet_ros.core.types import Array, TRACKED
 from djet_ros.errors import DjetError
+from djet_ros.lab.processed import processed
+from djet_ros.odometry.messages import stamp_ns
+from djet_ros.odometry.tracker import Tracker
+from djet_ros.recordings.decoding import message_type
+from djet_ros.recordings.recording import Recording
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -62,6 +70,32 @@ class ImuFit:
             canonical=True)]
 
 
+def rotations_and_rates(recording: Recording, config: Config, advance: Callable[[], None]
+                        ) -> tuple[VisualRotations, NDArray[np.int64], Array]:
+    """
+    Return the rotations between images, and stamps (M,) in ns and rates (M, 3) of the gyro.
+
+    Raises DjetError, see ``processed``.
+    """
+    tracker = Tracker(config, message_type, image_topic=recording.image_topic)
+    ends: list[tuple[int, int]] = []
+    rotations, stamps, rates = [], [], []
+
+    def take(topic: str, message: Any) -> None:
+        if topic == recording.auxiliary['imu']:
+            rate = message.angular_velocity
+            stamps.append(stamp_ns(message.header))
+            rates.append((rate.x, rate.y, rate.z))
+
+    for result in processed(recording, tracker, advance, take):
+        if result.status in TRACKED and result.since_ns is not None:
+            ends.append((result.since_ns, result.stamp_ns))
+            rotations.append(result.motion[:3, :3].T)
+    start, end = np.array(ends, np.int64).reshape(-1, 2).T
+    return (VisualRotations(start, end, np.array(rotations).reshape(-1, 3, 3)),
+            np.array(stamps, np.int64), np.array(rates, np.float64).reshape(-1, 3))
+
+
 def fit_imu(rotations: VisualRotations, stamps_ns: NDArray[np.int64], rates: Array,
             widest: float = 0.5) -> ImuFit:
     """
@@ -72,9 +106,10 @@ def fit_imu(rotations: VisualRotations, stamps_ns: NDArray[np.int64], rates: Arr
     DjetError if there are too few pairs, or their rotations do not determine the offset.
     """
     visual = rotations.rates()
-    if len(visual) < _LEAST_PAIRS or visual.std(0).max() < _LEAST_CHANGE:
+    change = float(visual.std(0).max()) if len(visual) else 0.0
+    if len(visual) < _LEAST_PAIRS or change < _LEAST_CHANGE:
         raise DjetError(f'{len(visual)} pairs whose angular rates vary by '
-                        f'{visual.std(0).max():.3f} rad/s do not determine an offset; record at '
+                        f'{change:.3f} rad/s do not determine an offset; record at '
                         f'least {_LEAST_PAIRS}, and rotate the camera back and forth about all '
                         'axes')
     gyro = _orientations(stamps_ns, rates)

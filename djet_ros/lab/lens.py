@@ -18,6 +18,7 @@ from djet_ros.core.lens import (
 )
 from djet_ros.core.types import Array, RelativePose, Status
 from djet_ros.errors import DjetError
+from djet_ros.lab.processed import processed
 from djet_ros.lab.style import COLOURS, figure
 from djet_ros.odometry.camera import Camera, is_rectified
 from djet_ros.odometry.tracker import Tracker
@@ -167,29 +168,18 @@ def _pairs(recording: Recording, config: Config, advance: Callable[[], None]) ->
     """Yield the pairs of a recording; raise DjetError if the camera changes."""
     tracker = _tracker(recording, config)
     camera: Camera | None = None
-    info: Any = None
-    for topic, _, message in recording.messages():
-        if topic == recording.info_topic:
-            tracker.camera_info(message)
-            if camera is None:
-                camera, info = tracker.camera, message
-            if tracker.counts.rejected_infos and tracker.problem is not None:
-                raise tracker.problem
-            if tracker.camera is not camera:
-                raise DjetError('the CameraInfo changes within this recording; split it there')
-        elif topic == recording.image_topic:
-            processed, last = tracker.counts.processed, None
-            tracker.image(message)
-            advance()
-            if tracker.counts.processed > processed:
-                last = tracker.last
-            if camera is not None and last is not None and last.status is Status.OK \
-                    and last.relative is not None:
-                yield _Pair(camera, info, last.relative)
-    if not tracker.counts.processed:
-        raise tracker.problem or DjetError(
-            f'none of {tracker.counts.received} images came after a CameraInfo on '
-            f'{recording.info_topic}; record it too, or choose one with --info-topic')
+    infos: list[Any] = []
+
+    def take(topic: str, message: Any) -> None:
+        if topic == recording.info_topic and not infos:
+            infos.append(message)
+
+    for result in processed(recording, tracker, advance, take):
+        camera = camera or tracker.camera
+        if camera is None or tracker.camera is not camera:
+            raise DjetError('the CameraInfo changes within this recording; split it there')
+        if result.status is Status.OK and result.relative is not None:
+            yield _Pair(camera, infos[0], result.relative)
 
 
 def calibration(report: LensReport) -> str:

@@ -9,8 +9,7 @@ from djet_ros.cli.options import add_topics
 from djet_ros.cli.terminal import progress_bar
 from djet_ros.config.sections import Config
 from djet_ros.errors import DjetError
-from djet_ros.lab.imu_offset import fit_imu
-from djet_ros.lab.visual_turns import rotations_and_rates
+from djet_ros.lab.imu_offset import fit_imu, rotations_and_rates
 from djet_ros.recordings.recording import open_recording
 import numpy as np
 
