@@ -517,6 +517,18 @@ def test_results_of_other_code_or_libraries_are_not_mixed(other, tmp_path):
         RecordStore(tmp_path, PairRecord, {'methods': ['djet']})
 
 
+def test_files_of_others_are_not_replaced(road, tmp_path):
+    (tmp_path / 'index.html').write_text('a page of mine')
+    run = ('evaluate', road, '--end', '3', '--presets', 'best', '--methods', 'five_point',
+           '--workers', '1', '--output', tmp_path)
+    answer = djet(*run)
+    assert answer.returncode == 2
+    assert 'holds earlier results; choose another --output, or replace them' in answer.stderr
+    assert (tmp_path / 'index.html').read_text() == 'a page of mine'
+    assert djet(*run, '--overwrite').returncode == 0
+    assert (tmp_path / 'index.html').read_text() != 'a page of mine'
+
+
 def test_a_damaged_store_is_named(road, tmp_path):
     run = ('evaluate', road, '--end', '3', '--presets', 'best', '--methods', 'five_point',
            '--workers', '1', '--output', tmp_path)

@@ -37,6 +37,9 @@ _PUBLISHED = ("The paper's Table 2, as printed there: another sequence (VAROS, a
 _RATIOS = ('Ratios of mean and median errors to those of D-JET with the unchanged preset, on the '
            'pairs that both estimated. In brackets is the 95 % interval of a paired bootstrap '
            'over pairs: if it contains 1, the difference is not significant.')
+# What an ablation writes into its folder.
+FILES = ('index.html', 'ablation.csv', 'ablation.md', 'pairs.csv', 'timings.csv', 'plots')
+
 _MARKERS = {'djet': 'o', 'rpe': 'D', 'five_point': 's'}
 _LINE = 0.24
 

@@ -77,6 +77,9 @@ _PAGE = """\
 </html>
 """
 
+# What an evaluation writes into its folder.
+FILES = ('index.html', 'table1.csv', 'table1.md', 'table1.tex', 'pairs.csv', 'timings.csv',
+         'drift.csv', 'evo.csv', 'plots', 'trajectories')
 
 # Trajectories of one sequence by preset and method.
 Estimates = dict[str, dict[str, StampedTrajectory]]

@@ -7,7 +7,7 @@ completion.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import asdict
 import json
 import math
@@ -20,6 +20,7 @@ from djet_ros import __version__
 from djet_ros.errors import DjetError
 from djet_ros.lab.provenance import code_digest, versions
 from djet_ros.recordings.closing import Closing
+from djet_ros.recordings.outputs import check_room
 import numpy as np
 
 FILE_NAME = 'records.jsonl'
@@ -33,13 +34,16 @@ class RecordStore(Closing, Generic[R]):
     The records of a run in ``folder/records.jsonl``, including those of an interrupted run.
 
     kind: dataclass of a record; settings: everything that decides the results, except for the code
-    of this package and the versions of its libraries, which are added. Raises DjetError if the
-    file has other settings, code or versions, unless overwrite is set.
+    of this package and the versions of its libraries, which are added; results: names of what the
+    run will write into the folder. Raises DjetError if the file has other settings, code or
+    versions, or is absent while a result is there, unless overwrite is set.
     """
 
-    def __init__(self, folder: Path, kind: Callable[..., R], settings: Mapping[str, Any], *,
-                 overwrite: bool = False) -> None:
+    def __init__(self, folder: Path, kind: Callable[..., R], settings: Mapping[str, Any],
+                 results: Collection[str] = (), *, overwrite: bool = False) -> None:
         self.path = folder / FILE_NAME
+        if not self.path.exists():
+            check_room(folder, results, overwrite)
         self.chunks: dict[str, list[R]] = {}
         self._kind = kind
         settings = _with_code(settings)

@@ -8,7 +8,7 @@ from djet_ros.cli.lab.pair_runs import add_run_arguments, evaluated, shared_valu
 from djet_ros.cli.options import split
 from djet_ros.errors import DjetError
 from djet_ros.lab.ablation import ablation_methods, PARTS
-from djet_ros.lab.ablation_report import write_ablation
+from djet_ros.lab.ablation_report import FILES, write_ablation
 
 DESCRIPTION = """\
 Estimate the relative pose of all consecutive frames by D-JET with the parameters of a preset, and
@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     """Run all variants, and print the tables."""
     competing = ablation_methods(split(args.presets), split(args.parts), _windows(args.windows),
                                  shared_values(args), good_start=args.good_start)
-    with evaluated(args, competing) as (datasets, records):
+    with evaluated(args, competing, FILES) as (datasets, records):
         tables = write_ablation(args.output, datasets, competing, records)
     show(tables, args.output)
     return 0

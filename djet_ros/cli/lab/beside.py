@@ -75,7 +75,8 @@ def run(args: argparse.Namespace) -> int:
 def _moments(args: argparse.Namespace, chunks: Sequence[TrialChunk]) -> list[Moment]:
     config = from_flat(flag_values(args)).estimator
     settings = {'frames': args.frames, 'estimator': asdict(config)}
-    return run_and_record(args, Moment, settings, chunks, partial(run_trial, config=config))
+    return run_and_record(args, Moment, settings, ('beside.json',), chunks,
+                          partial(run_trial, config=config))
 
 
 def _show(rows: Sequence[Row], moments: Sequence[Moment]) -> None:

@@ -102,7 +102,8 @@ def _records(args: argparse.Namespace, datasets: Sequence[Dataset],
     config = from_flat(flag_values(args)).estimator
     settings = {'sequences': [dataset.settings() for dataset in datasets],
                 'estimator': asdict(config)}
-    with (RecordStore(args.output, Coverage, settings, overwrite=args.overwrite) as store,
+    with (RecordStore(args.output, Coverage, settings, ('coverage.json', 'reliability.png'),
+                      overwrite=args.overwrite) as store,
           progress_bar('pairs') as progress):
         return run_chunks(executor, chunks_of(datasets, PAIRS_PER_CHUNK),
                           partial(cover_chunk, config=config), store, progress)

@@ -8,7 +8,7 @@ from djet_ros.cli.lab.pair_runs import add_run_arguments, evaluated, shared_valu
 from djet_ros.cli.options import split
 from djet_ros.lab.evo import find_tool
 from djet_ros.lab.methods import default_methods, make_methods, TITLES
-from djet_ros.lab.report import write_report
+from djet_ros.lab.report import FILES, write_report
 
 DESCRIPTION = """\
 Estimate the relative pose of all consecutive frames by several methods on the same matches, and
@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     competing = make_methods(methods, split(args.presets), shared_values(args))
     if args.evo:
         find_tool('evo_ape')
-    with evaluated(args, competing) as (datasets, records):
+    with evaluated(args, competing, FILES) as (datasets, records):
         tables = write_report(args.output, datasets, competing, records, with_evo=args.evo)
     show(tables, args.output)
     return 0

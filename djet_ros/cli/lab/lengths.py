@@ -61,7 +61,8 @@ def _drives(args: argparse.Namespace, chunks: Sequence[DriveChunk]) -> list[Driv
     config = from_flat(flag_values(args)).estimator
     settings = {'frames': args.frames, 'hidden': args.hidden, 'half': args.half,
                 'estimator': asdict(config)}
-    return run_and_record(args, Drive, settings, chunks, partial(run_drive, config=config))
+    return run_and_record(args, Drive, settings, ('lengths.json',), chunks,
+                          partial(run_drive, config=config))
 
 
 def _show(drives: Sequence[Drive]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from itertools import groupby
@@ -57,17 +57,22 @@ def shared_values(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def run_and_record(args: argparse.Namespace, kind: Callable[..., R], settings: Mapping[str, Any],
-                   chunks: Sequence[C], work: Callable[[C], list[R]]) -> list[R]:
-    """Process all chunks on this machine, with a progress bar, and store the records."""
-    with (RecordStore(args.output, kind, settings, overwrite=args.overwrite) as store,
+                   results: Collection[str], chunks: Sequence[C], work: Callable[[C], list[R]]
+                   ) -> list[R]:
+    """Process all chunks on this machine, with a progress bar; results: see ``RecordStore``."""
+    with (RecordStore(args.output, kind, settings, results, overwrite=args.overwrite) as store,
           local_workers(args.workers) as executor, progress_bar('pairs') as progress):
         return run(executor, chunks, work, store, progress)
 
 
 @contextmanager
-def evaluated(args: argparse.Namespace, competing: Sequence[Method]
+def evaluated(args: argparse.Namespace, competing: Sequence[Method], results: Collection[str]
               ) -> Iterator[tuple[list[Dataset], list[PairRecord]]]:
-    """Evaluate all pairs with a progress bar; datasets are readable only within the context."""
+    """
+    Evaluate all pairs with a progress bar; datasets are readable only within the context.
+
+    results: see ``RecordStore``.
+    """
     check_workers(args)
     selection = Selection(args.start, args.end, args.stride)
     # Frames of bags are extracted next to the results, which workers on other machines see too.
@@ -81,7 +86,8 @@ def evaluated(args: argparse.Namespace, competing: Sequence[Method]
                    else local_workers(args.workers))
         # Workers first: if there are none, earlier records are kept.
         with (workers as executor,
-              RecordStore(args.output, PairRecord, settings, overwrite=args.overwrite) as store,
+              RecordStore(args.output, PairRecord, settings, results,
+                          overwrite=args.overwrite) as store,
               progress_bar('pairs') as progress):
             records = run(executor, chunks_of(datasets),
                           partial(evaluate_chunk, methods=list(competing)), store, progress)
