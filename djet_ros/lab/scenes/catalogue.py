@@ -23,6 +23,7 @@ from djet_ros.lab.scenes.excursions import (
     build_handheld,
     build_indoor,
     build_whip,
+    centred_camera,
 )
 from djet_ros.lab.scenes.motorway import motorway, OWN_LANE, traffic
 from djet_ros.lab.scenes.panel import Mover, Panel, World
@@ -269,14 +270,11 @@ def _seafloor_world(seed: int) -> World:
 
 
 def _build_underwater(seed: int, size: tuple[int, int]) -> Scene:
-    width, height = size
-    K = np.array([[0.75 * width, 0, (width - 1) / 2], [0, 0.75 * width, (height - 1) / 2],
-                  [0, 0, 1]])
     path = Dive(_dive_route(), speed=0.15, height=2.2, tilt=np.deg2rad(23))
     lamp = Headlight(place=(0.5, -0.4, 0.0), aim=(-0.1, 0.12, 1.0), spread=0.42, power=5500,
                      ambient=70, clear=7.5, glow=45, sway=0.08)
     snow = MarineSnow(count=900, reach=6.0, drift=(0.004, 0.006, 0.0), tone=30)
-    return Scene('underwater', _seafloor_world(seed), path, K, size, seed,
+    return Scene('underwater', _seafloor_world(seed), path, centred_camera(size, 0.75), size, seed,
                  effects=(lamp, snow, SensorNoise(1.3, 0.12)), reach=18.0)
 
 

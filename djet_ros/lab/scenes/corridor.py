@@ -9,7 +9,7 @@ from djet_ros.lab.scenes import indoor_textures as paint
 from djet_ros.lab.scenes.cuboid import cuboid, frame
 from djet_ros.lab.scenes.panel import fitted, Panel, placed, tiled
 from djet_ros.lab.scenes.route import level_pose, Route, route_of
-from djet_ros.lab.scenes.texture import Texture
+from djet_ros.lab.scenes.texture import one_of, Texture
 import numpy as np
 
 CELL = 3.0
@@ -166,7 +166,7 @@ def _door(palette: Palette, rng: np.random.Generator) -> list[Panel]:
     if rng.random() < 0.5:
         panels += frame((0.05, -1.9, -0.025), (0.25, -1.3, -0.01), 0.02, palette.trim)
         panels.append(fitted((0.05, -1.9, -0.02), (0.2, 0, 0), (0, 0.6, 0), palette.dark))
-    note = palette.notes[int(rng.integers(len(palette.notes)))]
+    note = one_of(palette.notes, rng)
     panels.append(fitted((0.72, -1.6, -0.01), (0.16, 0, 0), (0, 0.16, 0), note))
     return panels
 
@@ -186,7 +186,7 @@ def _pictures(palette: Palette, rng: np.random.Generator) -> list[Panel]:
     for x in rng.choice([-0.95, -0.1, 0.55], int(rng.integers(1, 3)), replace=False):
         width, height = rng.uniform((0.4, 0.4), (0.65, 0.8))
         top = -1.5 - height / 2 + rng.normal(0, 0.04)
-        image = palette.pictures[int(rng.integers(len(palette.pictures)))]
+        image = one_of(palette.pictures, rng)
         panels += frame((x, top, -0.03), (x + width, top + height, 0), 0.025, palette.dark)
         panels.append(fitted((x, top, -0.01), (width, 0, 0), (0, height, 0), image,
                              mirror=bool(rng.integers(2))))
@@ -211,7 +211,7 @@ def _board(palette: Palette, rng: np.random.Generator) -> list[Panel]:
     panels.append(fitted((-0.7, -2.0, -0.01), (1.4, 0, 0), (0, 0.85, 0), palette.leaf, gain=0.75))
     for x in np.arange(-0.62, 0.5, 0.28):
         if rng.random() < 0.75:
-            note = palette.notes[int(rng.integers(len(palette.notes)))]
+            note = one_of(palette.notes, rng)
             panels.append(fitted((x, -1.92 + rng.uniform(0, 0.35), -0.012), (0.21, 0, 0),
                                  (0, 0.3, 0), note))
     return panels

@@ -9,7 +9,7 @@ from djet_ros.core.types import Array
 from djet_ros.lab.scenes import street_textures as paint
 from djet_ros.lab.scenes.panel import Panel, tiled
 from djet_ros.lab.scenes.route import pose_at
-from djet_ros.lab.scenes.texture import fractal, Gray, make_texture, Texture
+from djet_ros.lab.scenes.texture import fractal, Gray, make_texture, one_of, Texture
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
@@ -26,7 +26,7 @@ def fields(rng: np.random.Generator) -> tuple[Panel, ...]:
     start = -_FIELDS * _FIELD / 2
     return tuple(
         tiled((start + column * _FIELD, 0, start + row * _FIELD), (_FIELD, 0, 0), (0, 0, _FIELD),
-              kinds[int(rng.integers(len(kinds)))], start=tuple(rng.uniform(0, 12, 2)),
+              one_of(kinds, rng), start=tuple(rng.uniform(0, 12, 2)),
               gain=rng.uniform(0.75, 1.25))
         for row in range(_FIELDS) for column in range(_FIELDS))
 

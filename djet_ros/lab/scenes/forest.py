@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import cv2
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Array
-from djet_ros.lab.scenes.panel import fitted, Panel, placed, tiled
+from djet_ros.lab.scenes.panel import draped, fitted, Panel, placed, tiled
 from djet_ros.lab.scenes.route import level_pose, Route
-from djet_ros.lab.scenes.texture import fractal, Gray, make_texture, Texture
+from djet_ros.lab.scenes.texture import fractal, Gray, make_texture, one_of, soft, Texture
 import numpy as np
 
 _CELL = 1.5
@@ -83,16 +83,9 @@ class _Ground:
         panels = []
         for i, j in np.argwhere(close):
             right, far = corners[i, j + 1], corners[i + 1, j]
-            panels += [_draped(corners[i, j], right, far, texture),
-                       _draped(corners[i + 1, j + 1], far, right, texture)]
+            panels += [draped(corner, a - corner, b - corner, texture) for corner, a, b in (
+                (corners[i, j], right, far), (corners[i + 1, j + 1], far, right))]
         return panels
-
-
-def _draped(origin: Array, a: Array, b: Array, texture: Texture) -> Panel:
-    """Triangle between three corners, its texture laid over it from above."""
-    uv = np.stack([origin, a - origin, b - origin])[:, ::2] / texture.metres
-    uv[0] %= 1
-    return Panel(origin, a - origin, b - origin, texture, uv, triangle=True)
 
 
 def _trees(route: Route, ground: _Ground, palette: _Palette,
@@ -104,7 +97,7 @@ def _trees(route: Route, ground: _Ground, palette: _Palette,
         lean = rotation_exp(rng.normal(0, 0.05, 3) * (1, 0, 1))
         pose = level_pose(x, z, rng.uniform(0, 6), -ground.at(x, z) - 0.1)
         pose[:3, :3] = pose[:3, :3] @ lean
-        bark = palette.barks[int(rng.integers(len(palette.barks)))]
+        bark = one_of(palette.barks, rng)
         tree = _trunk(radius, height, bark, rng.uniform(0.6, 1.2))
         for _ in range(6):
             tree += _spray(rng, palette, height * rng.uniform(0.2, 0.95), rng.uniform(1.8, 4.2))
@@ -127,7 +120,7 @@ def _spray(rng: np.random.Generator, palette: _Palette, height: float,
     """Twigs with leaves: one picture of them at some height and slant."""
     pose = level_pose(0, 0, rng.uniform(0, 6), height)
     pose[:3, :3] = pose[:3, :3] @ rotation_exp(np.array([rng.uniform(-1.2, 1.2), 0, 0]))
-    leaves = palette.leaves[int(rng.integers(len(palette.leaves)))]
+    leaves = one_of(palette.leaves, rng)
     return placed([fitted((-size / 2, -size / 2, 0), (size, 0, 0), (0, size, 0), leaves,
                           gain=rng.uniform(0.7, 1.4), mirror=bool(rng.integers(2)))], pose)
 
@@ -141,7 +134,7 @@ def _undergrowth(route: Route, ground: _Ground, palette: _Palette,
             (palette.shrubs, _SHRUBS, 1.5, (0.7, 1.6))):
         for x, z in _places(route, rng, density, near, _LOW_MARGIN):
             size, turn = rng.uniform(least, most), rng.uniform(0, np.pi)
-            texture = textures[int(rng.integers(len(textures)))]
+            texture = one_of(textures, rng)
             foot = np.array([x, ground.at(x, z) + 0.06 * size, z])
             for angle in (turn, turn + np.pi / 2):
                 horizontal = size * np.array([np.cos(angle), 0, np.sin(angle)])
@@ -179,7 +172,7 @@ def _litter(rng: np.random.Generator) -> Texture:
                     float(image[int(y), int(x)] + tone), -1)
     # Light that comes through the canopy in patches.
     image *= 1 + 0.25 * np.clip(2 * fractal(rng, shape, 1.5) - 0.8, 0, 1)
-    return make_texture(_soft(image), metres)
+    return make_texture(soft(image), metres)
 
 
 def _bark(rng: np.random.Generator) -> Texture:
@@ -202,7 +195,7 @@ def _foliage(rng: np.random.Generator, density: float) -> Texture:
     rows, columns = places[:, 1].astype(int), places[:, 0].astype(int)
     kept = rng.random(len(places)) < likely[rows, columns]
     _draw(image, solid, rng, places[kept], 88)
-    return make_texture(_soft(image), (2.0, 2.0), _soft(solid))
+    return make_texture(soft(image), (2.0, 2.0), soft(solid))
 
 
 def _draw(image: Gray, solid: Gray, rng: np.random.Generator, places: Array,
@@ -227,7 +220,7 @@ def _tuft(rng: np.random.Generator) -> Texture:
         blade = np.stack([foot + (tip - foot) * t ** 1.8, 255 + (top - 255) * t], axis=1)
         for target, ink in ((image, float(tone)), (solid, 255.0)):
             cv2.polylines(target, [blade.astype(np.int32)], False, ink, int(rng.integers(2, 5)))
-    return make_texture(_soft(image), (0.4, 0.4), _soft(solid))
+    return make_texture(soft(image), (0.4, 0.4), soft(solid))
 
 
 def _backdrop(rng: np.random.Generator) -> Texture:
@@ -237,9 +230,4 @@ def _backdrop(rng: np.random.Generator) -> Texture:
     for x, width in zip(rng.integers(0, 1000, 70), rng.integers(2, 9, 70)):
         image[100:, x:x + width] -= 28
     image += 60 * np.clip(np.linspace(1.2, -1.2, 512)[:, None] + fractal(rng, shape, 0.8), 0, 1)
-    return make_texture(_soft(image), (40.0, 18.0))
-
-
-def _soft(image: Gray) -> Gray:
-    """Limit the bandwidth of drawn edges to what texels can carry."""
-    return np.asarray(cv2.GaussianBlur(np.asarray(image, np.float32), (0, 0), 0.7), np.float32)
+    return make_texture(soft(image), (40.0, 18.0))

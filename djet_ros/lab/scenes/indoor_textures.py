@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import cv2
-from djet_ros.lab.scenes.texture import fractal, Gray, make_texture, Texture
+from djet_ros.lab.scenes.texture import fractal, make_texture, soft, Texture
 import numpy as np
 
 
@@ -64,7 +64,7 @@ def painting(rng: np.random.Generator) -> Texture:
         axes = tuple(int(c) for c in rng.integers(8, 60, 2))
         cv2.ellipse(image, centre, axes, float(rng.uniform(0, 180)), 0, 360,
                     float(rng.uniform(60, 230)), -1)
-    return _printed(image, (1.0, 1.0))
+    return make_texture(soft(image), (1.0, 1.0))
 
 
 def page(rng: np.random.Generator) -> Texture:
@@ -82,7 +82,7 @@ def page(rng: np.random.Generator) -> Texture:
         left, top = (int(c) for c in rng.integers(60, 260, 2))
         figure = 150 + 35 * fractal(rng, (256, 256), 1.2)
         image[top:top + 130, left:left + 170] = figure[:130, :170]
-    return _printed(image, (1.0, 1.0))
+    return make_texture(soft(image), (1.0, 1.0))
 
 
 def books(rng: np.random.Generator) -> Texture:
@@ -98,7 +98,7 @@ def books(rng: np.random.Generator) -> Texture:
             lower = y + int(rng.integers(3, 30))
             cv2.rectangle(image, (x + 4, y), (x + width - 6, lower), ink, -1)
         x += width
-    return _printed(image + 3 * fractal(rng, (256, 1024), 0.6), (1.0, 0.3))
+    return make_texture(soft(image + 3 * fractal(rng, (256, 1024), 0.6)), (1.0, 0.3))
 
 
 def wood(rng: np.random.Generator, tone: float) -> Texture:
@@ -126,7 +126,7 @@ def keyboard(rng: np.random.Generator) -> Texture:
             sign = (x + 5 + int(rng.integers(3, 8)), y + 3 + int(rng.integers(2, 7)))
             cv2.rectangle(image, (x + 5, y + 3), sign, 190.0, -1)
             x += width + 5
-    return _printed(image, (0.45, 0.15))
+    return make_texture(soft(image), (0.45, 0.15))
 
 
 def screen(rng: np.random.Generator) -> Texture:
@@ -143,7 +143,7 @@ def screen(rng: np.random.Generator) -> Texture:
             indent = int(rng.integers(6, 50))
             cv2.line(image, (left + indent, y), (left + int(rng.integers(60, width)), y),
                      150.0, 3)
-    return _printed(image, (1.0, 1.0))
+    return make_texture(soft(image), (1.0, 1.0))
 
 
 def carton(rng: np.random.Generator, tone: float) -> Texture:
@@ -155,10 +155,4 @@ def carton(rng: np.random.Generator, tone: float) -> Texture:
         x, y = (int(c) for c in rng.integers(4, 240, 2))
         cv2.rectangle(image, (x, y), (x + int(rng.integers(4, 40)), y + int(rng.integers(3, 12))),
                       float(rng.uniform(15, 245)), -1)
-    return _printed(image, (0.35, 0.35))
-
-
-def _printed(image: Gray, metres: tuple[float, float]) -> Texture:
-    """Texture of drawn shapes, whose edges are softened to what texels can carry."""
-    soft = cv2.GaussianBlur(np.asarray(image, np.float32), (0, 0), 0.7)
-    return make_texture(np.asarray(soft, np.float32), metres)
+    return make_texture(soft(image), (0.35, 0.35))

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-import cv2
 from djet_ros.core.types import Array
 from djet_ros.lab.scenes import street_objects as things, street_textures as paint
 from djet_ros.lab.scenes.panel import fitted, Mover, Panel, placed, tiled
 from djet_ros.lab.scenes.route import level_pose, Route
 from djet_ros.lab.scenes.street import along, country, strip
-from djet_ros.lab.scenes.texture import fractal, make_texture, Texture
+from djet_ros.lab.scenes.texture import fractal, make_texture, soft, Texture
 import numpy as np
 
 # Middles of lanes in metres to the right of the central reservation: that of the camera, that of
@@ -73,7 +72,7 @@ def _asphalt(rng: np.random.Generator) -> Texture:
     reservation = x < 2.4
     grass = (shape[0], int(reservation.sum()))
     image[:, reservation] = 92 + 22 * fractal(rng, grass, 0.8)
-    return make_texture(np.asarray(cv2.GaussianBlur(image, (0, 0), 0.7), np.float32), metres)
+    return make_texture(soft(image), metres)
 
 
 def _rail(rng: np.random.Generator) -> Texture:

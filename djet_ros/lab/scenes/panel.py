@@ -58,6 +58,13 @@ def tiled(origin: Vector, a: Vector, b: Vector, texture: Texture, *,
     return Panel(np.asarray(origin, float), a, b, texture, uv, gain, layer, triangle)
 
 
+def draped(origin: Array, a: Array, b: Array, texture: Texture) -> Panel:
+    """Triangle whose texture is laid over it from above, so that neighbours join."""
+    uv = np.stack([origin, a, b])[:, ::2] / texture.metres
+    uv[0] %= 1
+    return Panel(origin, a, b, texture, uv, triangle=True)
+
+
 def placed(panels: Iterable[Panel], pose: Array) -> list[Panel]:
     """Carry panels by a (4, 4) pose."""
     R, t = pose[:3, :3], pose[:3, 3]

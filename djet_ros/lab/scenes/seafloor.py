@@ -7,9 +7,9 @@ from functools import cache
 import cv2
 from djet_ros.core.geometry import rotation_exp, unit
 from djet_ros.core.types import Array
-from djet_ros.lab.scenes.panel import Panel, placed, tiled
+from djet_ros.lab.scenes.panel import draped, Panel, placed, tiled
 from djet_ros.lab.scenes.route import level_pose, Route
-from djet_ros.lab.scenes.texture import fractal, make_texture, Texture
+from djet_ros.lab.scenes.texture import fractal, make_texture, soft, Texture
 import numpy as np
 
 _CELL = 0.8
@@ -28,7 +28,7 @@ def seafloor(route: Route, rng: np.random.Generator) -> tuple[Panel, ...]:
     for row, column in np.argwhere(distance < _MARGIN):
         a, b = corners[row, column], corners[row + 1, column + 1]
         for c in (corners[row, column + 1], corners[row + 1, column]):
-            panels.append(_draped(c, a - c, b - c, sand))
+            panels.append(draped(c, a - c, b - c, sand))
     boulder = rng.random(distance.shape) < _BOULDERS_PER_CELL
     for row, column in np.argwhere((distance < _MARGIN) & boulder):
         # Low rocks below the vehicle, high ones aside.
@@ -47,13 +47,6 @@ def _relief(route: Route, rng: np.random.Generator) -> Array:
     return np.stack(np.broadcast_arrays(x, hills[:len(z), :len(x)], z[:, None]), axis=-1)
 
 
-def _draped(origin: Array, a: Array, b: Array, texture: Texture) -> Panel:
-    """Triangle whose texture is laid over it from above, so that neighbours join."""
-    uv = np.stack([origin, a, b])[:, ::2] / texture.metres
-    uv[0] %= 1
-    return Panel(origin, a, b, texture, uv, triangle=True)
-
-
 def _sand(rng: np.random.Generator) -> Texture:
     """Sand with ripples that come and go, and a few pebbles and shells."""
     shape, metres = (1024, 1024), (8.0, 8.0)
@@ -66,7 +59,7 @@ def _sand(rng: np.random.Generator) -> Texture:
         axes = (int(rng.integers(1, 5)), int(rng.integers(1, 4)))
         cv2.ellipse(image, (int(x), int(z)), axes, float(rng.uniform(0, 180)), 0, 360,
                     float(rng.choice([55.0, 90.0, 185.0, 215.0])), -1)
-    return make_texture(np.asarray(cv2.GaussianBlur(image, (0, 0), 0.7), np.float32), metres)
+    return make_texture(soft(image), metres)
 
 
 def _rock(rng: np.random.Generator) -> Texture:

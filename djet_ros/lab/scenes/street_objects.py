@@ -7,7 +7,7 @@ from itertools import pairwise
 
 from djet_ros.lab.scenes import street_textures as paint
 from djet_ros.lab.scenes.panel import fitted, Panel, tiled
-from djet_ros.lab.scenes.texture import Texture
+from djet_ros.lab.scenes.texture import one_of, Texture
 import numpy as np
 
 # Outline of a car in metres from its rear bottom corner, round the upper side.
@@ -88,7 +88,7 @@ def house(rng: np.random.Generator, palette: Palette, width: float) -> list[Pane
         panels += [tiled((x, -height, HOUSE_DEPTH / 2), (0, 0, half * HOUSE_DEPTH / 2),
                          (0, -ridge, 0), palette.wall, gain=0.75 * gain, triangle=True)
                    for half in (-1, 1)]
-    tiles = palette.roofs[int(rng.integers(len(palette.roofs)))]
+    tiles = one_of(palette.roofs, rng)
     for eaves, shade in ((-0.4, 0.9), (HOUSE_DEPTH, 0.7)):
         panels.append(tiled((left - 0.3, -height - ridge, HOUSE_DEPTH / 2), (width + 0.6, 0, 0),
                             (0, ridge + 0.15, eaves - HOUSE_DEPTH / 2), tiles, gain=shade))
@@ -97,7 +97,7 @@ def house(rng: np.random.Generator, palette: Palette, width: float) -> list[Pane
 
 def tree(rng: np.random.Generator, palette: Palette) -> list[Panel]:
     """Three pictures of a tree that cross in its trunk."""
-    texture = palette.trees[int(rng.integers(len(palette.trees)))]
+    texture = one_of(palette.trees, rng)
     width, height = np.array(texture.metres) * rng.uniform(0.75, 1.25)
     turn, gain = rng.uniform(0, np.pi), rng.uniform(0.7, 1.2)
     panels = []
@@ -147,7 +147,7 @@ def _car_textures(rng: np.random.Generator, tone: float) -> _Car:
 
 def car(rng: np.random.Generator, palette: Palette) -> list[Panel]:
     """Car along z: its outline as two sides, and a strip from side to side along the outline."""
-    textures = palette.cars[int(rng.integers(len(palette.cars)))]
+    textures = one_of(palette.cars, rng)
     length, height = _CAR_SIZE
     half = _CAR_WIDTH / 2
     panels = [fitted((x, -height, 0), (0, 0, length), (0, height, 0), textures.side, gain=gain)

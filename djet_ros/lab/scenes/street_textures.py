@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import cv2
 from djet_ros.core.types import Array
-from djet_ros.lab.scenes.texture import fractal, Gray, make_texture, Texture
+from djet_ros.lab.scenes.texture import fractal, Gray, make_texture, soft, Texture
 import numpy as np
-from numpy.typing import NDArray
 
 ROAD_WIDTH = 14.4
 HALF_LANE = 5.0
@@ -30,7 +27,7 @@ def road(rng: np.random.Generator) -> Texture:
     image[:, np.abs(np.abs(x) - HALF_LANE) < 0.1] += 45
     image[:, np.abs(np.abs(x) - HALF_LANE + 0.2) < 0.1] -= 45
     image -= 55 * _shade(fractal(rng, shape, 1.6))
-    return make_texture(_soft(image), metres)
+    return make_texture(soft(image), metres)
 
 
 def _edge_lines(image: Gray, rng: np.random.Generator, x: Gray,
@@ -62,7 +59,7 @@ def ground(rng: np.random.Generator) -> Texture:
     shape = (1024, 1024)
     image = 88 + 26 * fractal(rng, shape, 0.7) + 16 * fractal(rng, shape, 1.6)
     _scatter(image, rng, 2500, (0.03, 0.1), (-35, 50), (16.0, 16.0))
-    return make_texture(_soft(image), (16.0, 16.0))
+    return make_texture(soft(image), (16.0, 16.0))
 
 
 def facade(rng: np.random.Generator, storeys: int, varied: bool = True) -> Texture:
@@ -87,7 +84,7 @@ def facade(rng: np.random.Generator, storeys: int, varied: bool = True) -> Textu
     image[:int(0.35 * height)] *= np.linspace(0.45, 1.0, int(0.35 * height))[:, None]
     if varied:
         image *= 1 - 0.5 * _shade(fractal(rng, shape, 1.7) - 0.5)
-    return make_texture(_soft(image), metres)
+    return make_texture(soft(image), metres)
 
 
 def _opening(image: Gray, rng: np.random.Generator, place: float, top: float,
@@ -142,7 +139,7 @@ def roof(rng: np.random.Generator) -> Texture:
     tiles = cv2.resize(rng.normal(0, 12, (20, 28)).astype(np.float32), (512, 512),
                        interpolation=cv2.INTER_NEAREST)
     image = 78 + relief + tiles + 8 * fractal(rng, shape, 1.2)
-    return make_texture(_soft(np.asarray(image, np.float32)), metres)
+    return make_texture(soft(np.asarray(image, np.float32)), metres)
 
 
 def tree(rng: np.random.Generator) -> Texture:
@@ -157,7 +154,7 @@ def tree(rng: np.random.Generator) -> Texture:
         for centre in lumps:
             leaves = rng.normal(centre, 26, (30, 2))
             _leaves(image, solid, rng, leaves, 45 + 85 * depth, (2, 6))
-    return make_texture(_soft(image + 5 * fractal(rng, shape, 0.7)), metres, _soft(solid))
+    return make_texture(soft(image + 5 * fractal(rng, shape, 0.7)), metres, soft(solid))
 
 
 def _trunk(image: Gray, solid: Gray, rng: np.random.Generator) -> None:
@@ -179,7 +176,7 @@ def hedge(rng: np.random.Generator) -> Texture:
     for depth in np.linspace(0, 1, 6):
         places = rng.uniform((0, 0), (1024, 256), (900, 2))
         _leaves(image, cover, rng, places, 30 + 90 * depth, (3, 8))
-    return make_texture(_soft(image + 6 * fractal(rng, shape, 0.7)), metres)
+    return make_texture(soft(image + 6 * fractal(rng, shape, 0.7)), metres)
 
 
 def fence(rng: np.random.Generator) -> Texture:
@@ -194,7 +191,7 @@ def fence(rng: np.random.Generator) -> Texture:
     for rail in (60, 190):
         solid[rail:rail + 20] = 255
         image[rail:rail + 20] -= 35
-    return make_texture(_soft(image), metres, _soft(solid))
+    return make_texture(soft(image), metres, soft(solid))
 
 
 def car_side(rng: np.random.Generator, profile: Array, metres: tuple[float, float],
@@ -219,7 +216,7 @@ def car_side(rng: np.random.Generator, profile: Array, metres: tuple[float, floa
             axes = (int(radius * scale[0]), int(radius * scale[1]))
             cv2.ellipse(image, wheel, axes, 0, 0, 360, value, -1)
             cv2.ellipse(solid, wheel, axes, 0, 0, 360, 255, -1)
-    return make_texture(_soft(image), metres, _soft(solid))
+    return make_texture(soft(image), metres, soft(solid))
 
 
 def _pixel(place: tuple[float, float], metres: tuple[float, float],
@@ -230,7 +227,7 @@ def _pixel(place: tuple[float, float], metres: tuple[float, float],
 def plain(rng: np.random.Generator, tone: float, roughness: float) -> Texture:
     """Surface of one tone with 1/f stains."""
     image = tone + roughness * (fractal(rng, (256, 256), 0.8) + fractal(rng, (256, 256), 1.6))
-    return make_texture(_soft(image), (4.0, 4.0))
+    return make_texture(soft(image), (4.0, 4.0))
 
 
 def car_end(rng: np.random.Generator, paint: float) -> Texture:
@@ -244,7 +241,7 @@ def car_end(rng: np.random.Generator, paint: float) -> Texture:
     cv2.rectangle(image, (92, 60), (164, 82), 240, -1)
     for x in range(98, 158, 10):
         cv2.line(image, (x, 65), (x + int(rng.integers(-4, 5)), 77), 30, 3)
-    return make_texture(_soft(image), (1.7, 0.6))
+    return make_texture(soft(image), (1.7, 0.6))
 
 
 def shadow(rng: np.random.Generator) -> Texture:
@@ -267,13 +264,13 @@ def lettering(rng: np.random.Generator, columns: int) -> Texture:
         stop = start + rng.normal(0, 25, 2)
         cv2.line(image, (int(start[0]), int(start[1])), (int(stop[0]), int(stop[1])),
                  float(rng.choice([20.0, 70.0, 130.0, 250.0])), int(rng.integers(2, 9)))
-    return make_texture(_soft(image), metres)
+    return make_texture(soft(image), metres)
 
 
 def sky(rng: np.random.Generator) -> Texture:
     """Thin clouds."""
     image = 205 + 12 * fractal(rng, (256, 256), 1.9)
-    return make_texture(_soft(image), (3000.0, 3000.0))
+    return make_texture(soft(image), (3000.0, 3000.0))
 
 
 def treeline(rng: np.random.Generator) -> Texture:
@@ -283,7 +280,7 @@ def treeline(rng: np.random.Generator) -> Texture:
     edge = 70 + 28 * fractal(rng, (4, 1024), 1.0)[:1]
     solid = np.clip((np.arange(256)[:, None] - edge) * 60 + 127 + 60 * fractal(rng, shape, 0.9),
                     0, 255)
-    return make_texture(_soft(image), metres, np.asarray(solid, np.float32))
+    return make_texture(soft(image), metres, np.asarray(solid, np.float32))
 
 
 def _leaves(image: Gray, solid: Gray, rng: np.random.Generator, places: Array, tone: float,
@@ -321,8 +318,3 @@ def _cracks(image: Gray, rng: np.random.Generator, count: int) -> None:
 def _shade(noise: Gray) -> Gray:
     """Dappled shadow, 0 to 1 with soft edges, where the noise is high."""
     return np.asarray(np.clip((noise - 0.35) * 4, 0, 1), np.float32)
-
-
-def _soft(image: NDArray[np.floating[Any]]) -> Gray:
-    """Limit the bandwidth of drawn edges to what texels can carry."""
-    return np.asarray(cv2.GaussianBlur(np.asarray(image, np.float32), (0, 0), 0.7), np.float32)

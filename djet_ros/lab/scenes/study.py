@@ -8,7 +8,7 @@ from djet_ros.lab.scenes import indoor_textures as paint
 from djet_ros.lab.scenes.cuboid import cuboid
 from djet_ros.lab.scenes.panel import fitted, Panel, placed, tiled
 from djet_ros.lab.scenes.route import level_pose
-from djet_ros.lab.scenes.texture import Texture
+from djet_ros.lab.scenes.texture import one_of, Texture
 import numpy as np
 
 # The room in metres about the camera's usual place: left, right, behind, ahead; and its height.
@@ -70,7 +70,7 @@ def _posters(palette: _Palette, rng: np.random.Generator) -> list[Panel]:
         flat: list[Panel] = []
         for layer, left in enumerate(places):
             width, height = rng.uniform((0.35, 0.4), (0.6, 0.75))
-            image = _one(palette.posters + palette.pages, rng)
+            image = one_of(palette.posters + palette.pages, rng)
             flat.append(fitted((left, rng.uniform(-1.62, -1.45), -0.004), (width, 0, 0),
                                (0, height, 0), image, gain=rng.uniform(0.75, 1.1),
                                layer=layer))
@@ -93,7 +93,7 @@ def _desk(palette: _Palette, rng: np.random.Generator) -> list[Panel]:
                              palette.keys)], _on_desk(0.0, near + 0.15, rng.normal(0, 0.1)))
     for layer, x in enumerate(rng.uniform(-1.05, 0.9, 7)):
         sheet = fitted((-0.1, -0.001 - 0.001 * layer, 0.14), (0.21, 0, 0), (0, 0, -0.29),
-                       _one(palette.pages, rng))
+                       one_of(palette.pages, rng))
         panels += placed([sheet], _on_desk(x, near + rng.uniform(0.17, 0.5), rng.normal(0, 0.5)))
     for x in np.concatenate([rng.uniform(-1.1, -0.5, 5), rng.uniform(0.35, 1.1, 6)]):
         panels += placed(_clutter(palette, rng, 0.24), _on_desk(
@@ -116,10 +116,10 @@ def _monitor(palette: _Palette) -> list[Panel]:
 def _clutter(palette: _Palette, rng: np.random.Generator, most: float) -> list[Panel]:
     """Box or pile of books that stands at the origin, up to so many metres high."""
     width, height, depth = rng.uniform((0.05, 0.05, 0.05), (0.2, most, 0.22))
-    texture = _one(palette.cartons + palette.books, rng)
+    texture = one_of(palette.cartons + palette.books, rng)
     start = (float(rng.uniform(0, 1)), float(rng.uniform(0, 1)))
     return cuboid((-width / 2, -height, -depth / 2), (width / 2, 0, depth / 2), texture,
-                  gain=rng.uniform(0.6, 1.15), start=start, lids=_one(palette.cartons, rng))
+                  gain=rng.uniform(0.6, 1.15), start=start, lids=one_of(palette.cartons, rng))
 
 
 def _shelf(palette: _Palette, rng: np.random.Generator, wall: float, y: float) -> list[Panel]:
@@ -130,7 +130,7 @@ def _shelf(palette: _Palette, rng: np.random.Generator, wall: float, y: float) -
         width, height = rng.uniform((0.1, 0.2), (0.35, 0.32))
         start = (float(rng.uniform(0, 1)), 0.3 - height)
         panels += cuboid((x, y - height, wall - rng.uniform(0.16, 0.24)), (x + width, y, wall),
-                         _one(palette.books, rng), start=start, gain=rng.uniform(0.7, 1.1),
+                         one_of(palette.books, rng), start=start, gain=rng.uniform(0.7, 1.1),
                          lids=palette.dark)
         x += width + rng.uniform(0.0, 0.12)
     return panels
@@ -147,7 +147,7 @@ def _bookcase(palette: _Palette, rng: np.random.Generator) -> list[Panel]:
             width, height = rng.uniform((0.1, 0.2), (0.4, 0.3))
             start = (float(rng.uniform(0, 1)), 0.3 - height)
             corner = (_LEFT + rng.uniform(0.16, 0.3), y, z + width)
-            panels += cuboid((_LEFT, y - height, z), corner, _one(palette.books, rng),
+            panels += cuboid((_LEFT, y - height, z), corner, one_of(palette.books, rng),
                              start=start, gain=rng.uniform(0.6, 1.0), lids=palette.dark)
             z += width + rng.uniform(0.0, 0.08)
     for z in (low, high):
@@ -162,13 +162,9 @@ def _floor_boxes(palette: _Palette, rng: np.random.Generator) -> list[Panel]:
         y, size = 0.0, 0.5
         for _ in range(int(rng.integers(1, 4))):
             height = rng.uniform(0.2, 0.4)
-            texture = _one(palette.cartons, rng)
+            texture = one_of(palette.cartons, rng)
             box = cuboid((-size / 2, -height, -size / 2), (size / 2, 0, size / 2), texture,
                          gain=rng.uniform(0.6, 1.0))
             panels += placed(box, level_pose(1.6, z, rng.normal(0, 0.12), y))
             y, size = y + height, size * 0.85
     return panels
-
-
-def _one(textures: list[Texture], rng: np.random.Generator) -> Texture:
-    return textures[int(rng.integers(len(textures)))]

@@ -8,7 +8,9 @@ blur it away.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 import scipy.fft
 
 Gray = NDArray[np.float32]
+Kind = TypeVar('Kind')
 
 # cv2.remap takes no destination wider than a signed 16-bit integer.
 _LONGEST_ROW = 32_000
@@ -92,6 +95,16 @@ def make_texture(image: Gray, metres: tuple[float, float],
                  opacity: Gray | None = None) -> Texture:
     """Texture from images (H, W) of 0 to 255; metres: (width, height) of one period."""
     return Texture(RipMap(image), metres, None if opacity is None else RipMap(opacity))
+
+
+def soft(image: NDArray[np.floating[Any]]) -> Gray:
+    """Limit the bandwidth of drawn edges (H, W) to what texels can carry."""
+    return np.asarray(cv2.GaussianBlur(np.asarray(image, np.float32), (0, 0), 0.7), np.float32)
+
+
+def one_of(kinds: Sequence[Kind], rng: np.random.Generator) -> Kind:
+    """Draw one of several kinds of a thing, mostly textures."""
+    return kinds[int(rng.integers(len(kinds)))]
 
 
 def fractal(rng: np.random.Generator, shape: tuple[int, int], slope: float,
