@@ -23,6 +23,7 @@ from djet_ros.errors import DjetError
 from djet_ros.lab.scenes.sequence import render_sequence
 from djet_ros.odometry.camera import Camera
 from djet_ros.odometry.messages import OPTICAL_TO_BODY, pose_of
+from djet_ros.posegraph import recorded_frames
 from djet_ros.posegraph.recorded_frames import frame_finder
 from djet_ros.posegraph.steps import Step
 from djet_ros.recordings.bag_writers import write_kitti_bag
@@ -31,11 +32,13 @@ from djet_ros.recordings.decoding import MAKE
 from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.recording import IMAGE_TOPIC, INFO_TOPIC, open_recording
 from djet_ros.recordings.trajectories import read_tum, TumWriter
+from djet_ros.replay import replay
 from djet_ros.replay.alignment import aligned, position_rmse
 from djet_ros.replay.drift import drift, scale_change
 from djet_ros.replay.ground_truth import GroundTruth
 from djet_ros.replay.lookahead import with_next_image
 from djet_ros.replay.pair_errors import pair_errors, statistics
+from djet_ros.replay.results import ResultsFolder
 import numpy as np
 import pytest
 from ros_messages import camera_info, header, image, message_type, STORE
@@ -125,6 +128,29 @@ def test_keyframe_images_have_the_masks_of_the_odometry(tmp_path):
         for i in (0, 1, 3, 5):
             left_out = frame_at(SECOND + i * SECOND // 10).left_out
             assert left_out is None if i == 3 else left_out[0].sum() == 10 + i
+
+
+def test_images_wait_for_masks_in_bounded_number_if_the_recorded_time_stands_still(
+        tmp_path, monkeypatch):
+    for module in (recorded_frames, replay):
+        monkeypatch.setattr(module, 'MOST_WAITING', 2)
+    still = [(topic, message, SECOND) for topic, message, _ in drive()]
+    mask = image(np.full(SIZE[::-1], 255, np.uint8), stamp_ns=SECOND // 2)
+    config = from_flat({'odometry.mask': True})
+    with open_recording(record(tmp_path / 'bag', [*still, ('/camera/mask', mask, SECOND)]),
+                        IMAGE_TOPIC, auxiliary={'mask': None}) as recording:
+        read, messages = [], recording.messages
+        monkeypatch.setattr(recording, 'messages', lambda topics=None: (
+            read.append(one) or one for one in messages(topics)))
+        frame_finder(recording, config)(SECOND)
+        assert len(read) == 6
+        read.clear()
+        done = []
+        with ResultsFolder(tmp_path / 'out', config) as results:
+            replay.Replay(recording, config, 'bag').run(results, lambda: done.append(len(read)))
+    assert len(done) == FRAMES
+    # Of the image, the CameraInfo that waits with it, and two images ahead.
+    assert done[0] <= 6
 
 
 def test_keyframe_images_have_the_residual_distortion_corrected(tmp_path):

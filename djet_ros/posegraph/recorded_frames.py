@@ -16,8 +16,11 @@ from djet_ros.odometry.messages import frame_of, stamp_ns
 from djet_ros.recordings.mask_files import static_mask
 from djet_ros.recordings.recording import Recording
 
-# Time of the recording, in ns, for which an image waits for its mask, as in a replay.
-_MASK_TIMEOUT_NS = 10**9
+# Time of the recording, in ns, for which an image waits for its auxiliary inputs: gyro rates,
+# guess and mask; and number of images that may wait, should that time stand still: more than the
+# fastest camera has in it.
+AUXILIARY_TIMEOUT_NS = 10**9
+MOST_WAITING = 500
 
 
 def frame_finder(recording: Recording, config: Config) -> Callable[[int], Frame]:
@@ -54,7 +57,8 @@ def _images(recording: Recording, config: Config, masks: Masks) -> Iterator[tupl
             waiting.append((recorded, camera, message))
         elif topic == mask_topic:
             masks.add(message)
-        while waiting and (not mask_topic or recorded - waiting[0][0] >= _MASK_TIMEOUT_NS
+        while waiting and (not mask_topic or len(waiting) > MOST_WAITING
+                           or recorded - waiting[0][0] >= AUXILIARY_TIMEOUT_NS
                            or masks.has(stamp_ns(waiting[0][2].header))):
             yield waiting.popleft()[1:]
     for _, of_image, message in waiting:

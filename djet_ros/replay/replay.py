@@ -26,6 +26,7 @@ from djet_ros.odometry.messages import (
 from djet_ros.odometry.scale import scale_source, ScaleSource
 from djet_ros.odometry.static_frames import StaticFrames
 from djet_ros.odometry.tracker import Outgoing, Tracker
+from djet_ros.posegraph.recorded_frames import AUXILIARY_TIMEOUT_NS, MOST_WAITING
 from djet_ros.posegraph.steps import Step
 from djet_ros.recordings.bags import BagMessage
 from djet_ros.recordings.datasets import LONGEST_GAP_NS
@@ -38,10 +39,6 @@ from djet_ros.replay.pair_errors import statistics
 from djet_ros.replay.results import PLOT, ResultsFolder, UNFINISHED
 from djet_ros.replay.step_log import StepLog
 import numpy as np
-
-# Time of the recording, in ns, for which an image waits for its auxiliary inputs: gyro rates,
-# guess and mask.
-_AUXILIARY_TIMEOUT_NS = 10**9
 
 
 class Outcome(NamedTuple):
@@ -93,9 +90,10 @@ class Replay:
         if not self._tracker.mounted and (frame := _frame_of_images(recording)) is not None:
             self._mount(frame)
 
-    def run(self, folder: ResultsFolder, progress: Callable[[], None] | None = None) -> Outcome:
+    def run(self, folder: ResultsFolder, progress: Callable[[], None] = lambda: None) -> Outcome:
         """Run to the end, calling progress after each image; KeyboardInterrupt is passed on."""
         self._folder = folder
+        self._progress = progress
         # The summary that a killed run leaves.
         folder.finish({**self._what(), **UNFINISHED})
         started = perf_counter()
@@ -103,12 +101,8 @@ class Replay:
         try:
             for message, following in with_next_image(self._recording):
                 self._following = following
-                for _ in range(self._take(message)):
-                    if progress is not None:
-                        progress()
-            for _ in range(self._work_off(None)):
-                if progress is not None:
-                    progress()
+                self._take(message)
+            self._work_off(None)
             self._folder.add_landmarks(self._tracker.unsettled())
             complete, problem = True, self._complaint()
         except DjetError as error:
@@ -124,8 +118,8 @@ class Replay:
             *self._log.advice(), *self._of_late_info(), *self._of_truth(), *(
                 f'{one.name}: {one.text}' for one in self._tracker.complaints_of_content)))
 
-    def _take(self, message: BagMessage) -> int:
-        """Take one message; return how many images were processed."""
+    def _take(self, message: BagMessage) -> None:
+        """Take one message, and process the images that waited for it."""
         recording, what = self._recording, self._names.get(message.topic)
         if message.topic in (recording.image_topic, recording.info_topic):
             self._first_ns.setdefault(message.topic, message.stamp_ns)
@@ -137,27 +131,24 @@ class Replay:
             self._tracker.tf_static(message.message)
         elif what is not None:
             getattr(self._tracker, what)(message.message)
-        return self._work_off(message.stamp_ns)
+        self._work_off(message.stamp_ns)
 
-    def _work_off(self, now_ns: int | None) -> int:
-        """Process the images that have all auxiliary inputs or timed out; return their number."""
-        done = 0
+    def _work_off(self, now_ns: int | None) -> None:
+        """Process the images that have all auxiliary inputs or timed out; None: all images."""
         while self._waiting:
             first = self._waiting[0]
             if first.topic == self._recording.info_topic:
                 self._info(self._waiting.popleft())
                 continue
-            following = self._after_the_first
-            if now_ns is not None and (
+            following = self._after_the_first()
+            if now_ns is not None and len(self._waiting) < MOST_WAITING and (
                     (following is None and self._tracker.follows_gap(first.message))
-                    or (now_ns - first.stamp_ns < _AUXILIARY_TIMEOUT_NS
+                    or (now_ns - first.stamp_ns < AUXILIARY_TIMEOUT_NS
                         and self._tracker.needs(first.message))):
                 break
             self._image(self._waiting.popleft(), following)
-            done += 1
-        return done
+            self._progress()
 
-    @property
     def _after_the_first(self) -> Any:
         """Return the second waiting image, or None."""
         images = [one for one in self._waiting if one.topic == self._recording.image_topic]
