@@ -17,9 +17,10 @@ from djet_ros.lab.evo import trajectory_metrics
 from djet_ros.lab.integration import StampedTrajectory
 from djet_ros.lab.style import COLOURS, figure
 from djet_ros.posegraph.graph_files import write_graph
-from djet_ros.posegraph.offline import PARAMETERS, Slam, trajectory_length
+from djet_ros.posegraph.offline import PARAMETERS, Slam
 from djet_ros.recordings.outputs import write_whole
 from djet_ros.replay.alignment import aligned, position_rmse
+from djet_ros.replay.drift import path_length
 import numpy as np
 
 PLOT = 'slam.png'
@@ -40,7 +41,7 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
     graph leave out rejected edges, as another backend would not know that they are wrong.
     """
     frames, graph = slam.frames, slam.optimised.graph
-    trajectories = {'before': slam.odometry_poses(), 'after': slam.optimised_poses()}
+    trajectories = {'before': frames.poses, 'after': slam.optimised_poses()}
     for label, poses in trajectories.items():
         StampedTrajectory(frames.stamps_ns, poses).write_tum(folder / f'{label}_tum.txt')
     for kind in ('g2o', 'csv'):
@@ -54,7 +55,7 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
         'frames': len(frames.poses), 'keyframes': len(graph.poses), 'edges': dict(kinds),
         'rejected': {kind: slam.optimised.rejected(kind) for kind in ('link', 'loop')
                      if kinds[kind]},
-        'way': trajectory_length(slam.odometry_poses()), 'parameters': parameters,
+        'way': path_length(frames.poses[:, :3, 3]), 'parameters': parameters,
         'version': __version__}
     known = np.isfinite(truth).all(axis=(1, 2))
     if known.sum() > 2:
@@ -68,7 +69,8 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
         except DjetError as error:
             # evo is not installed, or fails on a straight trajectory.
             summary['evo'] = str(error)
-    _plot(folder / PLOT, slam, truth if known.sum() > 2 else None, one_line(Path(name).name))
+    _plot(folder / PLOT, slam, {label: poses[:, :3, 3] for label, poses in trajectories.items()},
+          truth if known.sum() > 2 else None, one_line(Path(name).name))
     write_whole(folder / SUMMARY, json.dumps(summary, indent=2) + '\n')
     return summary
 
@@ -84,10 +86,9 @@ def _evo(folder: Path, label: str, metric: bool) -> dict[str, float]:
     return {f'evo_{name}': value for name, value in asdict(metrics).items()}
 
 
-def _plot(path: Path, slam: Slam, truth: Array | None, title: str) -> None:
-    """Plot the trajectory from above, before and after, and both errors over time."""
-    trajectories = {'before': slam.odometry_poses()[:, :3, 3],
-                    'after': slam.optimised_poses()[:, :3, 3]}
+def _plot(path: Path, slam: Slam, trajectories: dict[str, Array], truth: Array | None,
+          title: str) -> None:
+    """Plot trajectories (N, 3) from above, before and after, and both errors over time."""
     if truth is not None:
         trajectories = {label: aligned(positions, truth[:, :3, 3], slam.metric)
                         for label, positions in trajectories.items()}

@@ -44,10 +44,6 @@ class Slam:
         """Whether the odometry's lengths are in metres."""
         return self.scale is Scale.METRIC
 
-    def odometry_poses(self) -> Array:
-        """Return the poses (N, 4, 4) of all frames by odometry."""
-        return self.frames.poses
-
     def optimised_poses(self) -> Array:
         """Return the optimised poses (N, 4, 4) of all frames, each fixed in its keyframe."""
         keyframes, factors = self.optimised.graph.poses, self.optimised.factors
@@ -79,8 +75,3 @@ def run_slam(steps: Sequence[Step], recording: Recording, config: Config,
             if progress is not None:
                 progress(number, len(steps))
         return Slam(frames, offsets, growing.optimise(), scale_of(steps))
-
-
-def trajectory_length(poses: Array) -> float:
-    """Return the length of the trajectory through poses (N, 4, 4)."""
-    return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())

@@ -62,6 +62,11 @@ def drift(truth: Array, estimate: Array) -> Drift | None:
                  len(first), int(length.max()))
 
 
+def path_length(places: Array) -> float:
+    """Return the length of a path through places (N, 3)."""
+    return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+
+
 def path_scale(places: Array, truth: Array) -> float:
     """Return the factor that scales a path (N, 3) to the true one (N, 3), by their spread."""
     spread, true_spread = (np.linalg.norm(path - path.mean(0)) for path in (places, truth))

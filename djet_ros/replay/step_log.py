@@ -12,7 +12,7 @@ from djet_ros.odometry.messages import seconds_text
 from djet_ros.odometry.scale import Scale
 from djet_ros.posegraph.steps import scale_of, Step
 from djet_ros.replay.alignment import aligned, position_rmse
-from djet_ros.replay.drift import drift, path_scale, scale_change
+from djet_ros.replay.drift import drift, path_length, path_scale, scale_change
 from djet_ros.replay.pair_errors import pair_errors, PairErrors
 from djet_ros.replay.results import plot_trajectory
 import numpy as np
@@ -140,8 +140,7 @@ class StepLog:
         places = np.array([step.pose[:3, 3] for step in self.steps])[known]
         change = scale_change(places, way)
         return {'rmse_m': position_rmse(aligned(places, way, self.scale is Scale.METRIC), way),
-                'way_m': float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()),
-                'scale_change': change if np.isfinite(change) else None}
+                'way_m': path_length(way), 'scale_change': change if np.isfinite(change) else None}
 
     def plot(self, path: Path, truth: Array, landmarks: NDArray[np.float32], title: str) -> None:
         """
