@@ -57,6 +57,6 @@ def run(args: argparse.Namespace) -> int:
                     break
     finally:
         source.close()
-    late = f', the last {player.played.late:.1f} s late' if player.played.late > 0.1 else ''
-    print(f'{player.played.images} images published on {player.image_topic}{late}')
+    late = f', the last {player.late:.1f} s late' if player.late > 0.1 else ''
+    print(f'{player.images} images published on {player.image_topic}{late}')
     return 0

@@ -11,7 +11,7 @@ from djet_ros.core.types import Array
 from djet_ros.dds.graph import Graph, Publisher, Subscription
 from djet_ros.dds.names import Names
 from djet_ros.dds.trigger import TriggerServer
-from djet_ros.live.middleware import Profile, PublisherInfo
+from djet_ros.live.middleware import FRAMES_PROFILE, Profile, PublisherInfo
 from djet_ros.odometry.messages import ns_of_time, seconds_and_rest
 from djet_ros.odometry.static_frames import StaticFrames, TOPIC, TYPE
 from djet_ros.recordings.decoding import message_type
@@ -20,9 +20,6 @@ _GARBAGE_LOG_PERIOD = 5.0
 
 # Seconds between two checks for service clients that cannot be answered.
 _CLIENT_CHECK_PERIOD = 1.0
-
-# History depth of /tf_static: one message for each robot_state_publisher.
-_FRAMES_DEPTH = 100
 
 _LEVELS = {'info': 'INFO', 'warning': 'WARN', 'error': 'ERROR'}
 
@@ -95,9 +92,7 @@ class DdsMiddleware:
     def subscribe_tf(self) -> None:
         """Subscribe to /tf_static; moving frames need tf2, which is part of ROS."""
         if not self._tf_subscribed:
-            # Publishers of /tf_static latch their newest message.
-            self._graph.listen(TOPIC, TYPE, self._frames.add,
-                               Profile(depth=_FRAMES_DEPTH, latched=True),
+            self._graph.listen(TOPIC, TYPE, self._frames.add, FRAMES_PROFILE,
                                garbage=self._note_garbage)
         self._tf_subscribed = True
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from threading import Event
 from time import monotonic
 
 from djet_ros.dds.graph import Graph, Publisher
 from djet_ros.dds.names import Names
-from djet_ros.live.middleware import Profile
+from djet_ros.live.middleware import FRAMES_PROFILE, Profile
 from djet_ros.odometry.static_frames import TOPIC, TYPE
 from djet_ros.recordings.bags import BagMessage
 from djet_ros.recordings.decoding import MAKE, message_type
@@ -18,24 +17,17 @@ from djet_ros.recordings.recording import Recording
 _STREAM = Profile(depth=None)
 # CameraInfo, also for late subscribers.
 _LATCHED = Profile(depth=1, latched=True)
-# Static frames, of which each message has only some.
-_FRAMES = Profile(depth=100, latched=True)
 
 # Seconds from the discovery of a subscription here to the discovery of this publisher there.
 _DISCOVERY_TIME = 0.5
 
 
-@dataclass
-class Played:
-    """What was published; late: seconds by which the last message was behind schedule."""
-
-    images: int = 0
-    messages: int = 0
-    late: float = 0.0
-
-
 class Player:
-    """Publishes the messages of a recording at rate times its pace; clock: publish /clock."""
+    """
+    Publishes the messages of a recording at rate times its pace; clock: publish /clock.
+
+    images: number published so far; late: seconds by which the last message was behind schedule.
+    """
 
     def __init__(self, graph: Graph, recording: Recording, names: Names, rate: float = 1.0,
                  clock: bool = False) -> None:
@@ -46,7 +38,7 @@ class Player:
         self._rate = rate
         self._publishers: dict[str, Publisher] = {}
         self._clock = graph.advertise('/clock', 'rosgraph_msgs/msg/Clock') if clock else None
-        self.played = Played()
+        self.images, self.late = 0, 0.0
         self._advertise()
         self._publish_static_frames()
 
@@ -61,7 +53,8 @@ class Player:
                 self._publishers[one.topic] = self._graph.advertise(
                     self._names.resolve(one.topic), one.message.__msgtype__,
                     _LATCHED if one.topic == recording.info_topic
-                    else _FRAMES if one.topic == recording.auxiliary.get('frames') else _STREAM)
+                    else FRAMES_PROFILE if one.topic == recording.auxiliary.get('frames')
+                    else _STREAM)
             if not missing:
                 return
 
@@ -99,7 +92,7 @@ class Player:
             if stop.wait(max(0.0, due - monotonic())):
                 return
             self._send(one, stop)
-            self.played.late = monotonic() - due
+            self.late = monotonic() - due
         for publisher in self._publishers.values():
             while not (stop.is_set() or publisher.wait_until_taken(0.2)):
                 pass
@@ -111,5 +104,4 @@ class Player:
         while not self._publishers[one.topic].publish(one.message):
             if stop.wait(0.005):
                 return
-        self.played.messages += 1
-        self.played.images += one.topic == self._recording.image_topic
+        self.images += one.topic == self._recording.image_topic

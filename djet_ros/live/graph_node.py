@@ -8,7 +8,7 @@ from djet_ros.config.sections import Config, NODE_NAME
 from djet_ros.live.base_node import input_profile, LiveNode
 from djet_ros.live.graph_session import GraphSession
 from djet_ros.live.middleware import Middleware, Profile
-from djet_ros.live.topics import AUXILIARY_TYPES, graph_input_type, GRAPH_INPUTS, graph_outputs
+from djet_ros.live.topics import AUXILIARY_TYPES, GRAPH_INPUTS, graph_outputs
 from djet_ros.posegraph.live_slam import LiveSlam
 from djet_ros.recordings.mask_files import static_mask
 
@@ -29,16 +29,15 @@ class PoseGraphNode(LiveNode):
             {**topics, 'image': image, 'camera_info': info})
         self.update_tf_subscription()
         self.advertise(graph_outputs(tf=config.slam.publish_tf))
-        for name, callback in zip(GRAPH_INPUTS, (self.session.odometry,
-                                                 self.session.relative_pose,
-                                                 self.session.relative_pose_status)):
-            self.listen(topics[name], graph_input_type(name), callback, Profile(depth=_DEPTH),
-                        as_configured=False)
+        for (name, kind), callback in zip(GRAPH_INPUTS.items(), (
+                self.session.odometry, self.session.relative_pose,
+                self.session.relative_pose_status)):
+            self.listen(topics[name], kind, callback, Profile(depth=_DEPTH), as_configured=False)
+        profile = replace(input_profile(config.ros), depth=config.slam.image_buffer)
         if config.odometry.mask:
             self.listen(middleware.resolve('mask'), AUXILIARY_TYPES['mask'], self.session.mask,
-                        replace(input_profile(config.ros), depth=config.slam.image_buffer))
-        self.listen_to_camera(image, info, config.ros.image_transport,
-                              replace(input_profile(config.ros), depth=config.slam.image_buffer))
+                        profile)
+        self.listen_to_camera(image, info, config.ros.image_transport, profile)
         middleware.serve('~/reset', self.session.reset)
         self.log('info', f'odometry from {topics["odometry"]}, images from {image}, '
                          f'camera_info from {info}')

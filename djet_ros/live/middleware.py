@@ -35,6 +35,9 @@ class Profile:
 
 DEFAULT_PROFILE = Profile()
 
+# Of /tf_static: latched, with a message for each robot_state_publisher.
+FRAMES_PROFILE = Profile(depth=100, latched=True)
+
 
 class PublisherInfo(NamedTuple):
     """A publisher of a topic: its name for log messages, its ROS type and its QoS."""

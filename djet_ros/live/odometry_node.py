@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from djet_ros.config.sections import Config
 from djet_ros.live.base_node import input_profile, LiveNode
-from djet_ros.live.middleware import Middleware, Profile
+from djet_ros.live.middleware import FRAMES_PROFILE, Middleware
 from djet_ros.live.session import Session
 from djet_ros.live.topics import AUXILIARY_TYPES, odometry_outputs, SPEED_TYPES
 from djet_ros.odometry.moving_frames import TOPIC as TF
@@ -17,9 +17,6 @@ from djet_ros.recordings.mask_files import static_mask
 # History depths for the time in which Python does not get to run: of imu, guess and tf (seconds of
 # the fastest IMU), and of masks, which are as large and as frequent as images.
 _DEPTH, _MASKS_DEPTH = 2000, 100
-
-# History depth of /tf_static: one message for each robot_state_publisher.
-_FRAMES_DEPTH = 100
 
 
 class OdometryNode(LiveNode):
@@ -69,7 +66,7 @@ class OdometryNode(LiveNode):
             self.listen(self._middleware.resolve(TF), TF_TYPE, self.session.tf,
                         replace(input_profile(config.ros), depth=_DEPTH))
             self.listen(self._middleware.resolve(TF_STATIC), TF_TYPE, self.session.tf_static,
-                        Profile(depth=_FRAMES_DEPTH, latched=True), as_configured=False)
+                        FRAMES_PROFILE, as_configured=False)
             self._guess_tf_subscribed = True
         if config.odometry.scale == 'speed' and not self._speed_subscribed:
             for topic, kind in SPEED_TYPES.items():

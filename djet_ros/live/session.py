@@ -72,7 +72,7 @@ class Session:
         self._topics = topics
         self._queue: FrameQueue[_Received] = FrameQueue(
             node.queue_policy, node.queue_size, MAX_QUEUE_BYTES)
-        self._limit = _limit(tracker.config)
+        self._limit = RateLimit(*_limits(tracker.config))
         # Held while an image is processed and published, and by calls between two images.
         self._lock = Lock()
         self._turnstile = Lock()
@@ -180,7 +180,7 @@ class Session:
             self._log.clear()
             self._counted_drops = self._queue.dropped
             self._lost = self._counted_lost = self._skipped = 0
-            self._limit = _limit(self._tracker.config)
+            self._limit = RateLimit(*_limits(self._tracker.config))
             self._drops_logged = False
             self._tracker.reset()
             self._publish_diagnostics()
@@ -210,10 +210,8 @@ class Session:
         """Change parameters from the next image on; those of the queue cannot change."""
         with self._between_images():
             before = flat(self._tracker.config)
-            same = all(before[name].value == flat(config)[name].value
-                       for name in ('ros.max_rate', 'odometry.max_backwards', 'odometry.max_gap'))
-            if not same:
-                self._limit = _limit(config)
+            if _limits(config) != _limits(self._tracker.config):
+                self._limit = RateLimit(*_limits(config))
             self._tracker.configure(config)
         changed = [f'{item.name} = {item.value}' for item in flat(config).values()
                    if item.value != before[item.name].value]
@@ -409,9 +407,9 @@ class Session:
         self._logged_complaints = {one.name for one in complaints}
 
 
-def _limit(config: Config) -> RateLimit:
-    odometry = config.odometry
-    return RateLimit(config.ros.max_rate, odometry.max_backwards, odometry.max_gap)
+def _limits(config: Config) -> tuple[float, float, float]:
+    """Return the arguments of RateLimit."""
+    return config.ros.max_rate, config.odometry.max_backwards, config.odometry.max_gap
 
 
 def _bytes(message: Any) -> int:

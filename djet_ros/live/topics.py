@@ -36,9 +36,8 @@ _ODOMETRY_OUTPUTS = {
 }
 
 # Outputs of the odometry that the pose graph subscribes to.
-GRAPH_INPUTS = ('odometry', 'relative_pose_cov', 'relative_pose_status')
-
-_GRAPH_OUTPUTS = ('path', '/tf', '/diagnostics')
+GRAPH_INPUTS = {topic: _ODOMETRY_OUTPUTS[topic]
+                for topic in ('odometry', 'relative_pose_cov', 'relative_pose_status')}
 
 
 def odometry_outputs(config: NodeConfig) -> dict[str, str]:
@@ -49,12 +48,8 @@ def odometry_outputs(config: NodeConfig) -> dict[str, str]:
 
 def graph_outputs(*, tf: bool) -> dict[str, str]:
     """Return the output topics of the pose graph with their types."""
-    return {topic: _ODOMETRY_OUTPUTS[topic] for topic in _GRAPH_OUTPUTS if tf or topic != '/tf'}
-
-
-def graph_input_type(topic: str) -> str:
-    """Return the type of one of GRAPH_INPUTS."""
-    return _ODOMETRY_OUTPUTS[topic]
+    return {topic: _ODOMETRY_OUTPUTS[topic]
+            for topic in ('path', *['/tf'] * tf, '/diagnostics')}
 
 
 def image_topics(resolve: Callable[[str], str], is_remapped: Callable[[str], bool],

@@ -43,13 +43,9 @@ _OVERRIDES = QoSOverridingOptions((QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
                                    QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY))
 
 
+@cache
 def message_type(name: str) -> Any:
     """Return the class of a message type such as 'sensor_msgs/msg/Image'."""
-    return _message_type(name)
-
-
-@cache
-def _message_type(name: str) -> Any:
     package, kind, message = name.split('/')
     return getattr(import_module(f'{package}.{kind}'), message)
 
