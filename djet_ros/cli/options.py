@@ -58,12 +58,13 @@ def check_json_output(args: argparse.Namespace) -> None:
     check_file(args.output.with_suffix('.png'), args.overwrite)
 
 
-def write_json(path: Path, figures: dict[str, Any], draw: Callable[[Path], None]) -> None:
-    """Write the results as JSON, draw the plot next to it, and print both paths."""
+def write_json(path: Path, figures: Any, draw: Callable[[Path], None] | None = None) -> None:
+    """Write the results as JSON, and perhaps a plot next to it, and print the paths."""
     write_whole(path, json.dumps(figures, indent=2) + '\n')
     plot = path.with_suffix('.png')
-    draw(plot)
-    print(f'figures: {path}\nplot: {plot}')
+    if draw is not None:
+        draw(plot)
+    print(f'figures: {path}' + f'\nplot: {plot}' * (draw is not None))
 
 
 def add_frames(parser: argparse.ArgumentParser) -> None:
@@ -80,10 +81,12 @@ def add_workers(parser: argparse._ActionsContainer) -> None:
                         help='worker processes on this machine (default: one per core)')
 
 
-def check_workers(args: argparse.Namespace) -> None:
-    """Raise DjetError if --workers is below 1."""
-    if args.workers is not None and args.workers < 1:
-        raise DjetError(f'--workers is {args.workers}; it must be at least 1')
+def check_least(args: argparse.Namespace, **least: int) -> None:
+    """Raise DjetError if an option that is given is below its least value, by its name."""
+    for name, bound in least.items():
+        value = getattr(args, name)
+        if value is not None and value < bound:
+            raise DjetError(f'--{name} is {value}; it must be at least {bound}')
 
 
 # What the --*-topic options select.

@@ -6,9 +6,14 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from djet_ros.cli.options import add_json_output, check_json_output, RECORDINGS, write_json
+from djet_ros.cli.options import (
+    add_json_output,
+    check_json_output,
+    check_least,
+    RECORDINGS,
+    write_json,
+)
 from djet_ros.cli.terminal import console, new_table
-from djet_ros.errors import DjetError
 from djet_ros.lab.bench import bench, QUOTED_POINTS
 from rich.console import Console
 from rich.table import Table
@@ -33,8 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, write and print the results."""
     check_json_output(args)
-    if args.pairs < 1:
-        raise DjetError(f'--pairs is {args.pairs}; it must be at least 1')
+    check_least(args, pairs=1)
     with Console(stderr=True).status('measuring ...') as status:
         figures = bench(args.source, args.pairs,
                         lambda stage: status.update(f'measuring with {stage} ...'))

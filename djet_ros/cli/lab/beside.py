@@ -6,14 +6,12 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
-import json
 
 from djet_ros.cli.lab.pair_runs import run_and_record
-from djet_ros.cli.options import add_output, add_seeds, add_workers, check_workers, split
+from djet_ros.cli.options import add_output, add_seeds, add_workers, check_least, split, write_json
 from djet_ros.cli.terminal import compact_table, console
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
-from djet_ros.errors import DjetError
 from djet_ros.lab.beside import (
     is_wrong,
     Moment,
@@ -26,7 +24,7 @@ from djet_ros.lab.beside import (
 )
 from djet_ros.lab.methods import check_names
 from djet_ros.lab.pairs import FAILURE
-from djet_ros.recordings.outputs import make_folder, write_whole
+from djet_ros.recordings.outputs import make_folder
 import numpy as np
 from rich.table import Table
 
@@ -57,18 +55,14 @@ def run(args: argparse.Namespace) -> int:
     """Run all trials, and print the errors."""
     trials = split(args.trials)
     check_names('trial', trials, TRIALS)
-    check_workers(args)
-    if args.frames < 3:
-        raise DjetError(f'--frames is {args.frames}; it must be at least 3')
+    check_least(args, workers=1, frames=3)
     make_folder(args.output)
     moments = _moments(args, [TrialChunk(name, seed, args.frames)
                               for name in trials for seed in args.seeds])
     rows = trial_rows(moments)
     _show(rows, moments)
-    path = args.output / 'beside.json'
-    write_whole(path, json.dumps({'seeds': args.seeds, 'rows': [asdict(row) for row in rows]},
-                                 indent=1) + '\n')
-    print(f'figures: {path}')
+    write_json(args.output / 'beside.json',
+               {'seeds': args.seeds, 'rows': [asdict(row) for row in rows]})
     return 0
 
 

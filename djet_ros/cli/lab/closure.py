@@ -11,13 +11,13 @@ from typing import Any
 from djet_ros.cli.options import (
     add_json_output,
     check_json_output,
+    check_least,
     RECORDINGS,
     split,
     write_json,
 )
 from djet_ros.cli.terminal import console, new_table, progress_bar
 from djet_ros.core.estimator_config import METHODS
-from djet_ros.errors import DjetError
 from djet_ros.lab.closure import closures, summary, Triangle
 from djet_ros.lab.methods import check_names, TITLES
 from djet_ros.lab.sequences import plain_name, readable_frames
@@ -48,8 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Estimate the triplets, write and print their closure errors."""
     check_json_output(args)
-    if args.frames < 3:
-        raise DjetError(f'--frames is {args.frames}; it must be at least 3')
+    check_least(args, frames=3)
     methods, name = split(args.methods), plain_name(args.source)
     check_names('method', methods, CHOICES)
     with TemporaryDirectory() as workspace:

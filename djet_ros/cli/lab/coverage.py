@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import as_completed, Executor
-from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
-import json
-import os
 from pathlib import Path
-import shutil
 from typing import Any
 
+from djet_ros.cli.lab.pair_runs import datasets_of
 from djet_ros.cli.options import (
     add_frames,
     add_output,
     add_seeds,
     add_workers,
-    check_workers,
+    check_least,
     split,
+    write_json,
 )
 from djet_ros.cli.terminal import compact_table, console, new_table, progress_bar
 from djet_ros.config.flags import add_flags, flag_values
@@ -43,9 +41,9 @@ from djet_ros.lab.methods import check_names
 from djet_ros.lab.pairs import FAILURE
 from djet_ros.lab.runner import chunks_of, local_workers, run as run_chunks
 from djet_ros.lab.scenes import render_sequence, SCENES
-from djet_ros.lab.sequences import Dataset, open_datasets, Selection
+from djet_ros.lab.sequences import Dataset
 from djet_ros.lab.store import RecordStore
-from djet_ros.recordings.outputs import make_folder, write_whole
+from djet_ros.recordings.outputs import make_folder
 from rich.table import Table
 
 DESCRIPTION = """\
@@ -76,24 +74,21 @@ def run(args: argparse.Namespace) -> int:
     scenes = list(SCENES) if args.scenes == 'all' else split(args.scenes)
     if scenes:
         check_names('scene', scenes, SCENES)
-    check_workers(args)
-    if args.frames < 2:
-        raise DjetError(f'--frames is {args.frames}; it must be at least 2')
+    check_least(args, workers=1, frames=2)
     if not scenes and not args.sources:
         raise DjetError('no SOURCE and no --scenes: nothing to measure; name one of them')
     make_folder(args.output)
     with local_workers(args.workers) as executor:
         rendered = _rendered(executor, args.output / 'scenes',
                              [(name, seed) for name in scenes for seed in args.seeds], args.frames)
-        with _opened(args, rendered) as datasets:
+        with datasets_of(args, [*args.sources, *rendered]) as datasets:
             records = _records(args, datasets, executor)
     rows = coverage_rows(records)
     _show(rows, records)
-    path = args.output / 'coverage.json'
-    write_whole(path, json.dumps({'levels': LEVELS, 'rows': [asdict(row) for row in rows]},
-                                 indent=1) + '\n')
+    write_json(args.output / 'coverage.json',
+               {'levels': LEVELS, 'rows': [asdict(row) for row in rows]})
     draw_reliability(records, args.output / 'reliability.png')
-    print(f'figures: {path}\nplot: {args.output / "reliability.png"}')
+    print(f'plot: {args.output / "reliability.png"}')
     return 0
 
 
@@ -107,17 +102,6 @@ def _records(args: argparse.Namespace, datasets: Sequence[Dataset],
           progress_bar('pairs') as progress):
         return run_chunks(executor, chunks_of(datasets, PAIRS_PER_CHUNK),
                           partial(cover_chunk, config=config), store, progress)
-
-
-@contextmanager
-def _opened(args: argparse.Namespace, rendered: Sequence[Path]) -> Iterator[list[Dataset]]:
-    """Open all sequences; the extracted frames of bags exist only within the context."""
-    workspace = (args.output / f'.frames-{os.getpid()}').resolve()
-    try:
-        yield [*open_datasets([*args.sources, *rendered],
-                              Selection(args.start, args.end), workspace)]
-    finally:
-        shutil.rmtree(workspace, ignore_errors=True)
 
 
 def _rendered(executor: Executor, folder: Path, wanted: Sequence[tuple[str, int]],

@@ -6,16 +6,14 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
-import json
 
 from djet_ros.cli.lab.pair_runs import run_and_record
-from djet_ros.cli.options import add_output, add_seeds, add_workers, check_workers
+from djet_ros.cli.options import add_output, add_seeds, add_workers, check_least, write_json
 from djet_ros.cli.terminal import compact_table, console
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
-from djet_ros.errors import DjetError
 from djet_ros.lab.lengths import Drive, DriveChunk, run_drive, SEGMENTS_M
-from djet_ros.recordings.outputs import make_folder, write_whole
+from djet_ros.recordings.outputs import make_folder
 import numpy as np
 
 DESCRIPTION = """\
@@ -41,19 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run all streets, and print drift and consistency."""
-    check_workers(args)
-    if args.frames < 3:
-        raise DjetError(f'--frames is {args.frames}; it must be at least 3')
-    if args.hidden < 0:
-        raise DjetError(f'--hidden is {args.hidden}; it must not be negative')
+    check_least(args, workers=1, frames=3, hidden=0)
     size = (620, 188) if args.half else None
     make_folder(args.output)
     drives = _drives(args, [DriveChunk('road', seed, size, args.frames, args.hidden)
                             for seed in args.seeds])
     _show(drives)
-    path = args.output / 'lengths.json'
-    write_whole(path, json.dumps([asdict(drive) for drive in drives], indent=1) + '\n')
-    print(f'figures: {path}')
+    write_json(args.output / 'lengths.json', [asdict(drive) for drive in drives])
     return 0
 
 

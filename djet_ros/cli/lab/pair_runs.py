@@ -12,7 +12,7 @@ from pathlib import Path
 import shutil
 from typing import Any
 
-from djet_ros.cli.options import add_frames, add_output, add_workers, check_workers
+from djet_ros.cli.options import add_frames, add_output, add_workers, check_least
 from djet_ros.cli.terminal import console, progress_bar
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.lab.methods import Method
@@ -73,12 +73,8 @@ def evaluated(args: argparse.Namespace, competing: Sequence[Method], results: Co
 
     results: see ``RecordStore``.
     """
-    check_workers(args)
-    selection = Selection(args.start, args.end, args.stride)
-    # Frames of bags are extracted next to the results, which workers on other machines see too.
-    workspace = (args.output / f'.frames-{os.getpid()}').resolve()
-    try:
-        datasets = open_datasets(args.sources, selection, workspace)
+    check_least(args, workers=1)
+    with datasets_of(args, args.sources, args.stride) as datasets:
         make_folder(args.output)
         settings = {'sequences': [dataset.settings() for dataset in datasets],
                     'methods': [method.settings() for method in competing]}
@@ -92,6 +88,16 @@ def evaluated(args: argparse.Namespace, competing: Sequence[Method], results: Co
             records = run(executor, chunks_of(datasets),
                           partial(evaluate_chunk, methods=list(competing)), store, progress)
         yield datasets, records
+
+
+@contextmanager
+def datasets_of(args: argparse.Namespace, sources: Sequence[Path], stride: int = 1
+                ) -> Iterator[list[Dataset]]:
+    """Open all sequences; the extracted frames of bags exist only within the context."""
+    # Next to the results, which workers on other machines see too.
+    workspace = (args.output / f'.frames-{os.getpid()}').resolve()
+    try:
+        yield open_datasets(sources, Selection(args.start, args.end, stride), workspace)
     finally:
         shutil.rmtree(workspace, ignore_errors=True)
 
