@@ -588,6 +588,23 @@ def test_ground_truth_is_found_by_its_name(tmp_path):
         assert len(list(source.messages())) == 5
 
 
+def test_of_several_ground_truths_none_is_chosen_nor_taken_for_a_measurement(tmp_path):
+    zero = message_type('geometry_msgs/msg/Vector3')(0.0, 0.0, 0.0)
+    with_covariance = {
+        'pose': message_type('geometry_msgs/msg/PoseWithCovariance')(pose(1).pose, np.zeros(36)),
+        'twist': message_type('geometry_msgs/msg/TwistWithCovariance')(
+            message_type('geometry_msgs/msg/Twist')(zero, zero), np.zeros(36))}
+    truth = message_type('nav_msgs/msg/Odometry')(
+        header=MAKE.header(1, 'map'), child_frame_id='', **with_covariance)
+    path = record(tmp_path / 'bag', [*camera_messages(2), ('/ground_truth/pose', pose(1), SECOND),
+                                     ('/ground_truth/odom', truth, SECOND)])
+    with BagRecording(path) as source:
+        assert source.ground_truth_topic is None
+        assert sorted(source.ground_truth_choices) == ['/ground_truth/odom', '/ground_truth/pose']
+    with pytest.raises(DjetError, match="no topic for 'speed'"):
+        BagRecording(path, auxiliary={'speed': None})
+
+
 def test_messages_within_messages_of_ros_1_are_those_of_jazzy(tmp_path):
     noetic = get_typestore(Stores.ROS1_NOETIC)
 

@@ -971,6 +971,21 @@ def test_ground_truth_of_another_time_gives_a_warning(first, apart, why, tmp_pat
     assert summary(tmp_path / 'r')['drift'] is None
 
 
+def test_several_ground_truths_are_named_with_a_remedy(bag, tmp_path):
+    with Bag(bag) as whole:
+        messages = [(one.topic, one.message, one.stamp_ns) for one in whole.messages()]
+    twice = record(tmp_path / 'twice', [
+        *messages, *(('/ground_truth/base', message, stamp)
+                     for topic, message, stamp in messages if topic == '/ground_truth/pose')])
+    both = ('/ground_truth/base and /ground_truth/pose may be the ground truth; give that of the '
+            'camera as a file (--poses)\n')
+    done = djet('replay', twice, '--output', tmp_path / 'out')
+    assert done.stderr == f'djet: warning: no errors were computed: {both}'
+    answer = djet_alone('replay', twice, '--output', tmp_path / 'no', '--scale', 'ground_truth')
+    assert answer.returncode == 2
+    assert answer.stderr.endswith(f"odometry.scale is 'ground_truth', but {both}")
+
+
 def test_poses_are_read_from_every_kind_of_message():
     quaternion = message_type('geometry_msgs/msg/Quaternion')(x=0.0, y=0.0, z=1.0, w=0.0)
     point = message_type('geometry_msgs/msg/Point')(x=1.0, y=2.0, z=3.0)

@@ -8,7 +8,7 @@ would hold, so that all sources pass through the same tracker.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 import re
 from typing import Any
@@ -62,14 +62,16 @@ class Recording(Closing):
     Images, CameraInfo and optionally ground truth and auxiliary inputs, as messages in order.
 
     ``len()`` is the number of images, as far as it is known in advance. ground_truth_topic: None
-    if there is no ground truth; ground_truth_file: the file that replaces the recording's own, or
-    None; auxiliary: topics of the auxiliary inputs by their names in AUXILIARY, and under 'frames'
-    the topic of the static frames, which hold the mounting of an IMU.
+    if there is no ground truth, or if several topics may be it, ground_truth_choices;
+    ground_truth_file: the file that replaces the recording's own, or None; auxiliary: topics of
+    the auxiliary inputs by their names in AUXILIARY, and under 'frames' the topic of the static
+    frames, which hold the mounting of an IMU.
     """
 
     image_topic: str
     info_topic: str
     ground_truth_topic: str | None
+    ground_truth_choices: Sequence[str] = ()
     ground_truth_file: Path | None = None
     auxiliary: dict[str, str]
 
@@ -184,8 +186,11 @@ class BagRecording(Recording):
             image = self._choose('image', '--image-topic', IMAGE_TYPES, image_topic)
             self.image_topic, self._count = image.name, image.message_count
             self.info_topic = self._info_topic(info_topic)
-            self.ground_truth_topic = (self._ground_truth_topic() if poses is None
-                                       else GROUND_TRUTH_TOPIC)
+            choices = self._ground_truth_topics()
+            self.ground_truth_topic = (
+                GROUND_TRUTH_TOPIC if poses is not None else
+                choices[0] if len(choices) == 1 else None)
+            self.ground_truth_choices = choices if self.ground_truth_topic is None else ()
             self.auxiliary = dict(self._auxiliary_topics(auxiliary or {}, strict))
             self._require_one_type()
             self.ground_truth_file = poses
@@ -239,7 +244,7 @@ class BagRecording(Recording):
         for what, name in wanted.items():
             # The bag's ground truth is not a measurement, even if a file replaces it.
             have = [topic.name for topic in self._fitting(AUXILIARY[what])
-                    if topic.name not in (self._ground_truth_topic(), self.image_topic)]
+                    if topic.name not in (*self._ground_truth_topics(), self.image_topic)]
             pattern = _TOPIC_PATTERNS.get(what)
             chosen = [topic for topic in have if topic == name or (
                 name is None and (pattern is None or pattern.search(topic)))]
@@ -295,11 +300,10 @@ class BagRecording(Recording):
                                 '--info-topic')
         return self._choose('CameraInfo', '--info-topic', CAMERA_INFO_TYPES, name).name
 
-    def _ground_truth_topic(self) -> str | None:
-        """Return the only topic of poses with ground truth in its name, or None."""
-        fitting = [topic.name for topic in self._fitting(POSE_TYPES)
-                   if re.search('ground_?truth', topic.name)]
-        return fitting[0] if len(fitting) == 1 else None
+    def _ground_truth_topics(self) -> list[str]:
+        """Return the topics of poses with ground truth in their names."""
+        return [topic.name for topic in self._fitting(POSE_TYPES)
+                if re.search('ground_?truth', topic.name)]
 
 
 def open_recording(path: Path, image_topic: str | None = None, info_topic: str | None = None,

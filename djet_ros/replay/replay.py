@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from time import perf_counter
@@ -248,8 +248,10 @@ class Replay:
                 f'{self._time_of_first_info()}; record it before the images']
 
     def _of_truth(self) -> list[str]:
-        """Return a warning if there is ground truth, but at none of the images."""
+        """Return a warning if there is ground truth, but at none of the images, or several."""
         images = self._log.stamps_ns
+        if choices := self._recording.ground_truth_choices:
+            return [f'no errors were computed: {_several(choices)}']
         if not len(self._truth) or not images.size \
                 or np.isfinite(self._truth.at(images)).any():
             return []
@@ -316,6 +318,11 @@ def _times(count: int) -> str:
     return 'once' if count == 1 else f'{count} times'
 
 
+def _several(topics: Sequence[str]) -> str:
+    return (f'{" and ".join(topics)} may be the ground truth; give that of the camera as a file '
+            '(--poses)')
+
+
 def _static_frames(recording: Recording) -> StaticFrames:
     """Read the static frames, as far as the recording can be read."""
     frames = StaticFrames()
@@ -338,6 +345,9 @@ def _frame_of_images(recording: Recording) -> str | None:
 def _scale(recording: Recording, config: Config) -> ScaleSource:
     """Return the scale source; for ground truth, it is read from the whole recording first."""
     positions = None
+    if config.odometry.scale == 'ground_truth' and recording.ground_truth_choices:
+        raise DjetError(f"odometry.scale is 'ground_truth', but "
+                        f'{_several(recording.ground_truth_choices)}')
     if config.odometry.scale == 'ground_truth' and recording.ground_truth_topic is not None:
         stamps, poses = GroundTruth.of(recording).known()
         positions = stamps, poses[:, :3, 3]
