@@ -6,15 +6,17 @@ from itertools import pairwise
 from pathlib import Path
 
 from djet_ros.cli.main import main
+from djet_ros.config.sections import Config
 from djet_ros.core.geometry import rotation_angle, rotation_exp
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.lab.imu_offset import fit_imu, VisualRotations
+from djet_ros.lab.imu_offset import fit_imu, rotations_and_rates, VisualRotations
 from djet_ros.lab.scenes.imu import feel, Mems, TO_CAMERA
 from djet_ros.lab.scenes.sequence import render_sequence
 from djet_ros.lab.scenes.walk import HandHeld
 from djet_ros.recordings.bag_writers import ResultBag
 from djet_ros.recordings.decoding import MAKE
+from djet_ros.recordings.recording import BagRecording
 import numpy as np
 import pytest
 
@@ -81,10 +83,37 @@ def test_the_command_prints_lines_for_a_parameter_file(
     assert abs(np.dot((x, y, z, w), (0.5, -0.5, 0.5, 0.5))) > np.cos(np.radians(1))
 
 
+def still_bag(path: Path, focal: float, images: int) -> Path:
+    """Record black images with an IMU at rest."""
+    K = np.array([[focal, 0, focal], [0, focal, focal], [0, 0, focal > 0]])
+    with ResultBag(path) as bag:
+        for stamp in range(PERIOD, (images + 1) * PERIOD, PERIOD):
+            for topic, message in (
+                    ('/imu', MAKE.imu(stamp, 'imu', np.zeros(3), np.zeros(3))),
+                    ('/camera_info', MAKE.camera_info(stamp, 'camera', K, (100, 100))),
+                    ('/image_raw', MAKE.picture(stamp, 'camera', np.zeros((100, 100), np.uint8)))):
+                bag.write(topic, message, stamp)
+    return path
+
+
 def test_a_recording_without_an_imu_is_named(
         small_kitti: object, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['lab', 'imu-offset', str(small_kitti())]) == 2  # type: ignore[operator]
     assert 'holds no IMU data' in capsys.readouterr().err
+
+
+def test_a_recording_is_used_up_to_its_damage(tmp_path: Path) -> None:
+    bag = still_bag(tmp_path / 'bag', 50.0, 40)
+    file = tmp_path / 'bag' / 'bag.mcap'
+    file.write_bytes(file.read_bytes()[:file.stat().st_size // 2])
+    warned: list[str] = []
+    with BagRecording(bag, auxiliary={'imu': None}) as recording:
+        _, stamps, _ = rotations_and_rates(recording, Config(), lambda: None, warned.append)
+    assert 10 < len(stamps) < 30
+    assert len(warned) == 1 and 'cut short' in warned[0]
+    with BagRecording(bag, auxiliary={'imu': None}) as recording, \
+            pytest.raises(DjetError, match='cut short'):
+        rotations_and_rates(recording, Config(), lambda: None)
 
 
 @pytest.mark.parametrize(('focal', 'reason'), [
@@ -92,14 +121,6 @@ def test_a_recording_without_an_imu_is_named(
     (50.0, '0 pairs whose angular rates vary by 0.000 rad/s')])
 def test_a_recording_without_a_pair_is_told_the_reason(
         tmp_path: Path, capsys: pytest.CaptureFixture[str], focal: float, reason: str) -> None:
-    K = np.array([[focal, 0, focal], [0, focal, focal], [0, 0, focal > 0]])
-    with ResultBag(tmp_path / 'bag') as bag:
-        for stamp in range(PERIOD, 4 * PERIOD, PERIOD):
-            for topic, message in (
-                    ('/imu', MAKE.imu(stamp, 'imu', np.zeros(3), np.zeros(3))),
-                    ('/camera_info', MAKE.camera_info(stamp, 'camera', K, (100, 100))),
-                    ('/image_raw', MAKE.picture(stamp, 'camera', np.zeros((100, 100), np.uint8)))):
-                bag.write(topic, message, stamp)
-    assert main(['lab', 'imu-offset', str(tmp_path / 'bag')]) == 2
+    assert main(['lab', 'imu-offset', str(still_bag(tmp_path / 'bag', focal, 3))]) == 2
     error = capsys.readouterr().err
     assert reason in error and error.count('\n') == 1

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from djet_ros.cli.options import add_overwrite, add_topics, output_path, RECORDINGS
 from djet_ros.cli.replay import configuration
-from djet_ros.cli.terminal import progress_bar
+from djet_ros.cli.terminal import progress_bar, warn
 from djet_ros.config.flags import add_flags
 from djet_ros.errors import one_line
 from djet_ros.lab.lens import calibration, examine, LensReport, plot_lens
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     config = configuration(args)
     with open_recording(args.source, args.image_topic, args.info_topic) as recording, \
             progress_bar('lens', len(recording)) as advance:
-        report = examine(recording, config, advance)
+        report = examine(recording, config, advance, warn)
     print(_summary(report, args.source))
     if args.output is not None:
         _write(args.output, report, args)

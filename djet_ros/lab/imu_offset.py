@@ -10,7 +10,7 @@ from djet_ros.config.sections import Config
 from djet_ros.core.geometry import rotation_log
 from djet_ros.core.types import Array, TRACKED
 from djet_ros.errors import DjetError
-from djet_ros.lab.processed import processed
+from djet_ros.lab.processed import processed, refuse
 from djet_ros.odometry.messages import stamp_ns
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.recordings.decoding import message_type
@@ -70,7 +70,8 @@ class ImuFit:
             canonical=True)]
 
 
-def rotations_and_rates(recording: Recording, config: Config, advance: Callable[[], None]
+def rotations_and_rates(recording: Recording, config: Config, advance: Callable[[], None],
+                        warn: Callable[[str], None] = refuse
                         ) -> tuple[VisualRotations, NDArray[np.int64], Array]:
     """
     Return the rotations between images, and stamps (M,) in ns and rates (M, 3) of the gyro.
@@ -87,7 +88,7 @@ def rotations_and_rates(recording: Recording, config: Config, advance: Callable[
             stamps.append(stamp_ns(message.header))
             rates.append((rate.x, rate.y, rate.z))
 
-    for result in processed(recording, tracker, advance, take):
+    for result in processed(recording, tracker, advance, take, warn):
         if result.status in TRACKED and result.since_ns is not None:
             ends.append((result.since_ns, result.stamp_ns))
             rotations.append(result.motion[:3, :3].T)

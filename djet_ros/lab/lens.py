@@ -18,7 +18,7 @@ from djet_ros.core.lens import (
 )
 from djet_ros.core.types import Array, RelativePose, Status
 from djet_ros.errors import DjetError
-from djet_ros.lab.processed import processed
+from djet_ros.lab.processed import processed, refuse
 from djet_ros.lab.style import COLOURS, figure
 from djet_ros.odometry.camera import Camera, is_rectified
 from djet_ros.odometry.tracker import Tracker
@@ -90,15 +90,16 @@ class LensReport:
                 and self.moved_pixels(self.fit.k1) > _VISIBLE_PX)
 
 
-def examine(recording: Recording, config: Config, advance: Callable[[], None]) -> LensReport:
+def examine(recording: Recording, config: Config, advance: Callable[[], None],
+            warn: Callable[[str], None] = refuse) -> LensReport:
     """
     Run a recording through the odometry, and estimate the coefficient k1 from its pairs.
 
-    At most 2000 pairs of 300 matches are kept, spread over the recording. Raises DjetError if they
-    do not determine k1.
+    At most 2000 pairs of 300 matches are kept, spread over the recording; warn: see ``processed``.
+    Raises DjetError if they do not determine k1.
     """
     informative, pairs, every = list[MatchedPair](), 0, 1
-    for seen in _pairs(recording, config, advance):
+    for seen in _pairs(recording, config, advance, warn):
         pairs += 1
         pair = MatchedPair.of(seen.relative, seen.camera.K)
         if pairs % every == 0 and is_informative(pair, seen.camera):
@@ -164,7 +165,8 @@ def _tracker(recording: Recording, config: Config) -> Tracker:
                    static_mask=static_mask(config.odometry.mask_file))
 
 
-def _pairs(recording: Recording, config: Config, advance: Callable[[], None]) -> Iterator[_Pair]:
+def _pairs(recording: Recording, config: Config, advance: Callable[[], None],
+           warn: Callable[[str], None]) -> Iterator[_Pair]:
     """Yield the pairs of a recording; raise DjetError if the camera changes."""
     tracker = _tracker(recording, config)
     camera: Camera | None = None
@@ -174,7 +176,7 @@ def _pairs(recording: Recording, config: Config, advance: Callable[[], None]) ->
         if topic == recording.info_topic and not infos:
             infos.append(message)
 
-    for result in processed(recording, tracker, advance, take):
+    for result in processed(recording, tracker, advance, take, warn):
         camera = camera or tracker.camera
         if camera is None or tracker.camera is not camera:
             raise DjetError('the CameraInfo changes within this recording; split it there')

@@ -8,18 +8,26 @@ from typing import Any
 from djet_ros.errors import DjetError
 from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.tracker import Tracker
+from djet_ros.recordings.bags import BagMessage
 from djet_ros.recordings.recording import Recording
 
 
+def refuse(damage: str) -> None:
+    """Raise DjetError, where a damaged recording is of no use."""
+    raise DjetError(damage)
+
+
 def processed(recording: Recording, tracker: Tracker, advance: Callable[[], None],
-              take: Callable[[str, Any], None]) -> Iterator[OdometryResult]:
+              take: Callable[[str, Any], None], warn: Callable[[str], None]
+              ) -> Iterator[OdometryResult]:
     """
     Run a recording through the odometry; yield the result of each frame that it processes.
 
-    advance: called after each image; take: called with topic and message of everything else.
-    Raises DjetError if a CameraInfo is invalid, or no image comes after one.
+    advance: called after each image; take: called with topic and message of everything else;
+    warn: called with the damage of a recording, which ends there. Raises DjetError if a CameraInfo
+    is invalid, or no image comes after one.
     """
-    for topic, _, message in recording.messages():
+    for topic, _, message in _up_to_damage(recording, warn):
         if topic != recording.image_topic:
             take(topic, message)
         if topic == recording.info_topic:
@@ -36,3 +44,10 @@ def processed(recording: Recording, tracker: Tracker, advance: Callable[[], None
         raise tracker.problem or DjetError(
             f'none of {tracker.counts.received} images came after a CameraInfo on '
             f'{recording.info_topic}; record it too, or choose one with --info-topic')
+
+
+def _up_to_damage(recording: Recording, warn: Callable[[str], None]) -> Iterator[BagMessage]:
+    try:
+        yield from recording.messages()
+    except DjetError as damage:
+        warn(str(damage))

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from djet_ros.cli.options import add_topics
-from djet_ros.cli.terminal import progress_bar
+from djet_ros.cli.terminal import progress_bar, warn
 from djet_ros.config.sections import Config
 from djet_ros.errors import DjetError
 from djet_ros.lab.imu_offset import fit_imu, rotations_and_rates
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     with open_recording(args.source, args.image_topic, args.info_topic,
                         auxiliary={'imu': args.imu_topic}) as recording, \
             progress_bar('imu-offset', len(recording)) as advance:
-        rotations, stamps, rates = rotations_and_rates(recording, Config(), advance)
+        rotations, stamps, rates = rotations_and_rates(recording, Config(), advance, warn)
     fit = fit_imu(rotations, stamps, rates, args.widest)
     print(f'odometry.imu_offset: {fit.offset:.5f}   # seconds, sigma {fit.offset_sigma:.5f}')
     print('odometry.imu_rotation: "' + ' '.join(f'{q:.6f}' for q in fit.quaternion()) + '"')
