@@ -89,11 +89,11 @@ def closure_rotation(before: RelativePose, after: RelativePose,
     Return the rotation vector (3,) of the closure error in rad, and its covariance (3, 3).
 
     before, after: motions from the first to the second view, and from the second to the third;
-    across: from the first to the third. Their errors are taken to be independent.
+    direct: from the first to the third. Their errors are taken to be independent.
     """
     closure = Rotation.from_matrix(direct.R @ (after.R @ before.R).T).as_rotvec()
-    C_before, C_after, C_across = (one.covariance_5[:3, :3] for one in (before, after, direct))
-    return closure, C_across + C_after + after.R @ C_before @ after.R.T
+    C_before, C_after, C_direct = (one.covariance_5[:3, :3] for one in (before, after, direct))
+    return closure, C_direct + C_after + after.R @ C_before @ after.R.T
 
 
 def summary(triangles: Sequence[Triangle | None]) -> dict[str, Any]:
