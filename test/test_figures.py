@@ -125,7 +125,7 @@ def test_two_images_and_a_camera_give_the_same_as_a_sequence(road, tmp_path, cap
 
 @pytest.mark.parametrize(('arguments', 'message'), [
     (['similarity', 'nowhere.png'], 'nowhere.png could not be read: No such file or directory'),
-    (['similarity', 'text'], 'text: compressed image is neither JPEG nor PNG'),
+    (['similarity', 'text'], 'text is neither a PNG nor a JPEG image'),
     (['similarity', 'image', '--points', '5,5'], 'point 5,5 is too close to the border'),
     (['similarity', 'image', '--points', '5'], "--points is '5'; write it as X,Y"),
     (['similarity', 'image', 'image', '--points', 'nan,5'],

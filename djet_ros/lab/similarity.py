@@ -14,7 +14,7 @@ from djet_ros.core.types import Array, View
 from djet_ros.errors import DjetError
 from djet_ros.lab import panels
 from djet_ros.lab.style import figure
-from djet_ros.odometry.images import BadMessage, decoded, to_8_bits
+from djet_ros.recordings.frame_sequence import ImageFiles
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,12 +44,7 @@ class Similarity:
 
 def read_image(path: Path) -> Gray:
     """Read a PNG or JPEG file as gray image (H, W). Raises DjetError."""
-    try:
-        return to_8_bits(decoded(np.fromfile(path, np.uint8)))
-    except OSError as error:
-        raise DjetError(f'{path} could not be read: {error.strerror or error}') from error
-    except BadMessage as problem:
-        raise DjetError(f'{path}: {problem}') from None
+    return ImageFiles([path]).gray(0)
 
 
 def self_similarity(gray: Gray, points: Array | None, count: int, radius: int,
