@@ -170,9 +170,10 @@ class LiveNode:
 
     def advertise(self, outputs: Mapping[str, str]) -> None:
         """Create publishers for the topics, given with their types, that have none yet."""
-        for topic in outputs.keys() - self._outputs.keys():
-            self._outputs[topic] = self._middleware.advertise(
-                self._middleware.resolve(full_name(topic)), outputs[topic])
+        for topic, kind in outputs.items():
+            if topic not in self._outputs:
+                self._outputs[topic] = self._middleware.advertise(
+                    self._middleware.resolve(full_name(topic)), kind)
 
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
                profile: Profile, ready: Callable[[], bool] | None = None, *,
