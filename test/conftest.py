@@ -29,6 +29,15 @@ def kitti() -> Path:
                 f'{ROOT.parent / "shared" / "data"} is not there')
 
 
+@pytest.fixture(scope='session')
+def tum(kitti: Path) -> Path:
+    """Folder of real frames of TUM freiburg1_rpy, from a hand that rotates the camera fast."""
+    folder = kitti.parent / 'tum' / 'rgbd_dataset_freiburg1_rpy'
+    if not folder.is_dir():
+        pytest.skip(f'no real frames: {folder} is not there')
+    return folder
+
+
 @pytest.fixture
 def small_kitti(tmp_path: Path) -> Callable[..., Path]:
     """Return a function that writes a sequence of noise images, and returns its folder."""

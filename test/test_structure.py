@@ -28,6 +28,7 @@ from djet_ros.odometry.scale import (
 from djet_ros.odometry.structure import TrackScale
 from djet_ros.odometry.uncertainty import motion_covariance, PathCovariance
 from djet_ros.odometry.visual_odometry import VisualOdometry
+from djet_ros.recordings.datasets import open_sequence
 import numpy as np
 import pytest
 
@@ -248,6 +249,32 @@ def test_a_bad_frame_does_not_change_the_scale(cards):
     assert bad.status not in TRACKED
     bridged = drive.go([pose(x=0.16, z=0.12)])[0]
     assert np.linalg.norm(bridged.motion[:3, 3]) == pytest.approx(2, rel=0.05)
+
+
+def test_the_usual_speed_is_a_mean_over_half_a_second(cards):
+    drive = Drive(cards)
+    drive.go([pose(x=0.16, z=0.12)] * 6)
+    assert drive.odometry._scale._speed == pytest.approx(10, rel=0.03)  # units per second
+    drive.go([pose(x=0.08, z=0.06)])  # half as fast
+    assert drive.odometry._scale._speed == pytest.approx(
+        10 - 5 * (1 - np.exp(-0.1 / 0.5)), rel=0.03)
+
+
+@pytest.mark.slow
+def test_the_scale_lasts_in_a_fast_hand_with_a_rolling_shutter(tum):
+    """A path that shrinks to a point fits the truth by a common scale as well as this one."""
+    sequence = open_sequence(tum)
+    odometry, lengths_in_mm = VisualOdometry(), []
+    for index in range(200):
+        result = odometry.process(sequence.frame(index))
+        if index and result.status is Status.OK:
+            true = np.linalg.norm((np.linalg.inv(sequence.poses[index - 1])
+                                   @ sequence.poses[index])[:3, 3])
+            lengths_in_mm.append((index, 1e3 * true / np.linalg.norm(result.motion[:3, 3])))
+    index, unit = np.array(lengths_in_mm).T
+    units = [np.median(unit[index // 40 == part]) for part in range(5)]
+    # Two was measured; without what holds it, 100,000.
+    assert max(units) < 5 * min(units)
 
 
 def test_after_a_gap_the_old_speed_is_the_guess(cards):
