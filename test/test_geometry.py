@@ -229,3 +229,14 @@ def test_depths_at_the_epipole_are_undetermined():
     x = np.array([[0.0, 0, 1]])
     _, sigma = inverse_depths(np.eye(3), np.array([0.0, 0, -1]), x, x)
     assert sigma[0] > 1e5
+
+
+def test_inverse_depths_of_several_poses_are_those_of_each():
+    rng = np.random.default_rng(5)
+    rays_x, rays_y = (np.column_stack([rng.normal(size=(20, 2)), np.ones(20)]) for _ in range(2))
+    R = rotation_exp(rng.normal(size=(4, 3)) * 0.1)
+    t = rng.normal(size=(4, 3))
+    rho, sigma = inverse_depths(R, t, rays_x, rays_y)
+    for index in range(4):
+        one, its_sigma = inverse_depths(R[index], t[index], rays_x, rays_y)
+        assert np.array_equal(rho[index], one) and np.array_equal(sigma[index], its_sigma)

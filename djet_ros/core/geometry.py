@@ -199,6 +199,8 @@ def inverse_depths(R: Array, t: Array, rays_x: Array, rays_y: Array) -> tuple[Ar
     """
     Triangulate inverse depths (N,) in A of matched rays (N, 3) with z = 1, in units of 1 / |t|.
 
+    For S poses, R (S, 3, 3) and t (S, 3), they are (S, N).
+
     By least squares of y x (R x + rho t) = 0, which is linear in rho: noise around zero stays
     unbiased. Also returns their standard deviations (N,) for unit noise in both x and y of the
     rays in B.
@@ -209,7 +211,9 @@ def inverse_depths(R: Array, t: Array, rays_x: Array, rays_y: Array) -> tuple[Ar
         -l.(d (e x y)) / l^2 = -d e.(y x l) / l^2.
     """
     # Component-wise: a third of the time of np.cross.
-    (m1, m2, m3), (y1, y2, y3), (t1, t2, t3) = R @ rays_x.T, rays_y.T, t
+    m, (y1, y2, y3) = R @ rays_x.T, rays_y.T
+    m1, m2, m3 = m[..., 0, :], m[..., 1, :], m[..., 2, :]
+    t1, t2, t3 = t[..., 0, None], t[..., 1, None], t[..., 2, None]
     s1, s2, s3 = y2 * m3 - y3 * m2, y3 * m1 - y1 * m3, y1 * m2 - y2 * m1
     l1, l2, l3 = y2 * t3 - y3 * t2, y3 * t1 - y1 * t3, y1 * t2 - y2 * t1
     squared = np.maximum(l1 * l1 + l2 * l2 + l3 * l3, 1e-12)

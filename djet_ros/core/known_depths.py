@@ -115,9 +115,8 @@ class KnownDepths:
         scaled, sigma = inverse_depths(pair.R, pair.t, rays_x, rays_y)
         variances, axes = np.linalg.eigh(pair.covariance_5)
         steps = (axes * np.sqrt(np.maximum(variances, 0.0))).T
-        moved = [inverse_depths(R, t, rays_x, rays_y)[0] for R, t in zip(
-            *moved_all(pair.R, pair.t, sphere_tangents(pair.t), steps))]
-        return Lengths(scaled / rho, rho / sigma, np.array(moved) / rho)
+        moved = moved_all(pair.R, pair.t, sphere_tangents(pair.t), steps)
+        return Lengths(scaled / rho, rho / sigma, inverse_depths(*moved, rays_x, rays_y)[0] / rho)
 
     def count_agreeing(self, pose: Pose, x: Array, y: Array) -> tuple[int, int]:
         """
