@@ -17,6 +17,7 @@ from djet_ros.posegraph.graph_files import write_graph
 from djet_ros.posegraph.pose_graph import Edge, PoseGraph
 from djet_ros.recordings.bag_writers import ResultBag
 from djet_ros.recordings.bags import Bag, BagMessage
+from djet_ros.recordings.recording import Recording
 from djet_ros.recordings.trajectories import read_tum
 from djet_ros.replay.graph_of_results import read_results
 from djet_ros.replay.replay import Replay
@@ -30,7 +31,7 @@ FRAMES = 5
 STEP = pose(x=0.25, z=0.15, yaw=0.01)
 
 
-class Drive:
+class Drive(Recording):
     """A source of images of cards; black ones and gaps in time as wanted."""
 
     image_topic, info_topic = '/image_rect', '/camera_info'
@@ -42,6 +43,9 @@ class Drive:
 
     def __len__(self):
         return FRAMES
+
+    def close(self):
+        pass
 
     def messages(self, topics=None):
         cards, here, stamp = Cards(), np.eye(4), 10**9
