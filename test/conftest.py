@@ -30,7 +30,7 @@ def kitti() -> Path:
 
 
 @pytest.fixture(scope='session')
-def tum(kitti: Path) -> Path:
+def freiburg1_rpy(kitti: Path) -> Path:
     """Folder of real frames of TUM freiburg1_rpy, from a hand that rotates the camera fast."""
     folder = kitti.parent / 'tum' / 'rgbd_dataset_freiburg1_rpy'
     if not folder.is_dir():

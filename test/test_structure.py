@@ -261,9 +261,9 @@ def test_the_usual_speed_is_a_mean_over_half_a_second(cards):
 
 
 @pytest.mark.slow
-def test_the_scale_lasts_in_a_fast_hand_with_a_rolling_shutter(tum):
+def test_the_scale_lasts_in_a_fast_hand_with_a_rolling_shutter(freiburg1_rpy):
     """A path that shrinks to a point fits the truth by a common scale as well as this one."""
-    sequence = open_sequence(tum)
+    sequence = open_sequence(freiburg1_rpy)
     odometry, lengths_in_mm = VisualOdometry(), []
     for index in range(200):
         result = odometry.process(sequence.frame(index))

@@ -191,8 +191,7 @@ class Window:
         self._append(view, relative, length)
         self._add_pair(relative, length, share)
         # Observe old and new landmarks in the frame; then refine all.
-        if (self._is_keyframe[-2] and not self._has_landmarks[-2] and relative.t.any()
-                and self.has_depths(relative)):
+        if self._is_keyframe[-2] and not self._has_landmarks[-2] and relative.t.any():
             self._create_landmarks(relative, length)
         self._observe_landmarks()
         before = self._poses.camera(0)[:3, 3]
@@ -420,17 +419,25 @@ class Window:
         Otherwise landmarks would be those that noise brings nearer: behind the camera, where it
         brings the others, there are none.
         """
-        x, y = relative.x[relative.inliers], relative.y_opt[relative.inliers]
-        rho, sigma = inverse_depths(relative.R, relative.t, self._rays(x), self._rays(y))
+        _, rho, sigma = self._triangulated(relative)
+        return self._exceed_noise(relative, rho, sigma)
+
+    def _exceed_noise(self, relative: RelativePose, rho: Array, sigma: Array) -> bool:
         noise = robust_scale(relative.residuals[relative.inliers]) / self._K[0, 0]
         return bool(median(rho / sigma) > self._tuning.depth_over_noise * noise)
 
-    def _create_landmarks(self, relative: RelativePose, length: float) -> None:
-        """Create landmarks from the matches of a keyframe with the frame after it."""
-        tuning, anchor = self._tuning, len(self._views) - 2
-        self._has_landmarks[anchor] = True
+    def _triangulated(self, relative: RelativePose) -> tuple[Array, Array, Array]:
+        """Return pixels (M, 2) of a pair's inliers, their inverse depths and their deviations."""
         x, y = relative.x[relative.inliers], relative.y_opt[relative.inliers]
-        rho, sigma = inverse_depths(relative.R, relative.t, self._rays(x), self._rays(y))
+        return x, *inverse_depths(relative.R, relative.t, self._rays(x), self._rays(y))
+
+    def _create_landmarks(self, relative: RelativePose, length: float) -> None:
+        """Create landmarks from a keyframe and the frame after it, unless depths are noise."""
+        tuning, anchor = self._tuning, len(self._views) - 2
+        x, rho, sigma = self._triangulated(relative)
+        if not self._exceed_noise(relative, rho, sigma):
+            return
+        self._has_landmarks[anchor] = True
         ahead, noise = rho > 0, tuning.slant_noise / self._K[0, 0] * sigma
         surfaces = x[ahead], rho[ahead], noise[ahead]
         usable = (rho > 0) & self._distances.describable(x, self._views[anchor].surface_gray.shape)

@@ -229,19 +229,19 @@ class TrackScale:
     def _added(self, view: View, relative: RelativePose, guess: float) -> WindowStep | None:
         """Add a frame to the window; return None and restart if it has no length."""
         if not self._window.is_new or (relative.t.any() and self._window.has_depths(relative)):
-            if self._interrupted:
-                guess, noise = self._resumed(relative, guess)
+            noise = 0.0
             try:
+                if self._interrupted:
+                    guess, noise = self._resumed(relative, guess)
                 addition = self._window.add(view, relative, guess)
             except np.linalg.LinAlgError:
-                # The bundle is singular, or no match of a rotation is on a landmark.
+                # Something is singular, or no match of a rotation is on a landmark.
                 addition = None
             if self._lens is not None:
                 self._lens = self._window.lens
             if addition is not None and np.isfinite(addition.sigma) and addition.length > 0:
-                if self._interrupted:
-                    self._filter.add_noise(noise**2)
-                    self._interrupted = False
+                self._filter.add_noise(noise**2)
+                self._interrupted = False
                 return addition
         self.begin(view, relative.R)
         return None

@@ -99,7 +99,7 @@ def asl_camera(path: Path) -> tuple[Intrinsics, Array]:
         named = sensor.get('distortion_model', 'radial-tangential')
         intrinsics = [float(value) for value in sensor['intrinsics']]
         distortion = [float(value) for value in sensor.get('distortion_coefficients', [])]
-        camera_in_body = rigid(sensor['T_BS']['data'])
+        camera_in_body = _rigid(sensor['T_BS']['data'])
     except _UNFIT as error:
         raise DjetError(f'{path} is no ASL camera description (intrinsics, T_BS): '
                         f'{one_line(error)}') from error
@@ -115,7 +115,7 @@ def kalibr_camera(path: Path) -> tuple[Intrinsics, Array]:
         named = camera['distortion_model']
         intrinsics = [float(value) for value in camera['intrinsics']]
         distortion = [float(value) for value in camera['distortion_coeffs']]
-        body_in_camera = rigid(camera['T_cam_imu'])
+        body_in_camera = _rigid(camera['T_cam_imu'])
     except _UNFIT as error:
         raise DjetError(f'{path} is no Kalibr camera chain (cam0: intrinsics, T_cam_imu): '
                         f'{one_line(error)}') from error
@@ -128,7 +128,7 @@ def asl_mounting(path: Path) -> Array:
     """Return the pose (4, 4) of a sensor in the body, from its sensor.yaml."""
     sensor = read_yaml(path)
     try:
-        pose = rigid(sensor['T_BS']['data'])
+        pose = _rigid(sensor['T_BS']['data'])
     except _UNFIT as error:
         raise DjetError(f'{path} is no ASL sensor description (T_BS): '
                         f'{one_line(error)}') from error
@@ -136,8 +136,7 @@ def asl_mounting(path: Path) -> Array:
     return pose
 
 
-def rigid(values: object) -> Array:
-    """Return 16 numbers as a matrix (4, 4); raises ValueError or TypeError for other values."""
+def _rigid(values: object) -> Array:
     return np.array(values, dtype=np.float64).reshape(4, 4)
 
 

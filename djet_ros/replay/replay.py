@@ -68,7 +68,7 @@ class Replay:
         """
         Prepare the run; DjetError if a parameter needs what the recording does not have.
 
-        draw: whether to write a drawing of each pair, which takes about as long as a fifth of it.
+        draw: whether to write a drawing of each pair.
         """
         self._recording = recording
         self._config = config
