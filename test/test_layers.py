@@ -21,9 +21,9 @@ MANIFEST = ElementTree.parse(Path(__file__).parents[1] / 'package.xml')
 ROS_LIBRARIES = {depend.text for depend in MANIFEST.iter('exec_depend')}
 
 # From the bottom up. Packages in one tuple do not import one another.
-ORDER = (('__init__', 'errors', 'libraries', 'threads'), ('compiled',), ('core',), ('config',),
-         ('odometry',), ('recordings',), ('posegraph',), ('replay',), ('live',), ('ros', 'dds'),
-         ('lab',), ('cli',))
+ORDER = (('__init__', 'errors', 'interrupts', 'libraries', 'threads'), ('compiled',), ('core',),
+         ('config',), ('odometry',), ('recordings',), ('posegraph',), ('replay',), ('live',),
+         ('ros', 'dds'), ('lab',), ('cli',))
 FLOOR = {room: floor for floor, rooms in enumerate(ORDER) for room in rooms}
 
 CORE_LIBRARIES = {'cv2', 'djet_ros', 'numpy', 'scipy'}

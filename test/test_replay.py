@@ -935,6 +935,38 @@ def test_interrupted_run_is_readable_and_marked_incomplete(folder, tmp_path, sig
     assert sign == signal.SIGKILL or len(found) >= 5
 
 
+@pytest.mark.slow
+def test_a_signal_within_a_write_waits_until_the_frame_is_in_all_results(folder, tmp_path):
+    """The signal comes at each place in turn where rosbags writes the third odometry."""
+    within = """
+import signal, sys
+from djet_ros.cli.main import main
+left, records = int(sys.argv.pop(1)), 0
+def watch(frame, event, _):
+    global left, records
+    if event != 'call' or 'rosbags' not in frame.f_code.co_filename:
+        return
+    records += frame.f_code.co_name == 'write' and frame.f_code.co_filename.endswith('/writer.py')
+    if records > 8:
+        left -= 1
+        if not left:
+            sys.setprofile(None)
+            signal.raise_signal(signal.SIGTERM)
+sys.setprofile(watch)
+sys.exit(main())
+"""
+    for place in range(1, 11, 3):
+        results = tmp_path / str(place)
+        ended = subprocess.run([sys.executable, '-c', within, str(place), 'replay', folder,
+                                '--output', results], capture_output=True, text=True, check=False)
+        assert ended.returncode == 143, ended.stderr
+        with Bag(results / 'bag') as out:
+            written = list(out.messages({'/vo_node/odometry'}))
+        poses = (results / 'trajectory_tum.txt').read_text().splitlines()
+        rows = (results / 'frames.csv').read_text().splitlines()[1:]
+        assert 0 < len(written) == len(poses) == len(rows) < FRAMES
+
+
 # Sources of ground truth
 
 def test_poses_of_a_file_replace_those_of_the_bag(bag, folder, tmp_path):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import atexit
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+import gc
 from importlib import import_module
 from io import TextIOWrapper
 import os
@@ -80,6 +82,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     one_blas_thread()
     sleep_while_waiting()
+    # What the system frees at once, the interpreter would search for cycles for a third of a
+    # second.
+    atexit.register(gc.freeze)
     _escape_unprintable()
     with _terminating_signals():
         return _main(argv)

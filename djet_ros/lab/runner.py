@@ -16,11 +16,12 @@ from multiprocessing import active_children, parent_process, resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
 import os
 import signal
-from threading import current_thread, main_thread, Thread
+from threading import Thread
 from typing import Any, Protocol, TypeVar
 
 from djet_ros import threads
 from djet_ros.errors import DjetError
+from djet_ros.interrupts import interrupt_after
 from djet_ros.lab.pairs import PairChunk
 from djet_ros.lab.sequences import Dataset
 from djet_ros.lab.store import in_order, RecordStore
@@ -92,7 +93,7 @@ def _as_completed(futures: Iterable[Future[R]]) -> Iterator[Future[R]]:
     """
     left = set(futures)
     while left:
-        with _interrupt_after():
+        with interrupt_after():
             ended, left = wait(left, _SIGNAL_DELAY_S, FIRST_COMPLETED)
         yield from ended
 
@@ -132,27 +133,8 @@ class _Pool(ProcessPoolExecutor):
     """Pool that defers Ctrl-C while a worker starts."""
 
     def submit(self, *args: Any, **kwargs: Any) -> Future[Any]:
-        with _interrupt_after():
+        with interrupt_after():
             return super().submit(*args, **kwargs)
-
-
-@contextmanager
-def _interrupt_after() -> Iterator[None]:
-    """Defer Ctrl-C, SIGTERM and SIGHUP to the end of this block."""
-    if current_thread() is not main_thread():
-        # Python handles signals in the main thread only.
-        yield
-        return
-    seen: list[int] = []
-    before = {number: signal.signal(number, lambda number, _: seen.append(number))
-              for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    if seen:
-        signal.raise_signal(seen[0])
 
 
 class _Worker(SpawnProcess):

@@ -14,6 +14,7 @@ from djet_ros import __version__, compiled
 from djet_ros.config.sections import Config
 from djet_ros.core.types import Status
 from djet_ros.errors import DjetError, one_line
+from djet_ros.interrupts import interrupt_after
 from djet_ros.odometry.diagnostics import Counts
 from djet_ros.odometry.health import ONE_CAMERA_MATRIX
 from djet_ros.odometry.messages import (
@@ -23,6 +24,7 @@ from djet_ros.odometry.messages import (
     seconds_text,
     stamp_ns,
 )
+from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.scale import scale_source, ScaleSource
 from djet_ros.odometry.static_frames import StaticFrames
 from djet_ros.odometry.tracker import Outgoing, Tracker
@@ -176,21 +178,27 @@ class Replay:
         started = perf_counter()
         outgoing = tracker.image(message.message, following)
         seconds = perf_counter() - started
-        if tracker.counts.processed > processed and tracker.last is not None:
-            result = tracker.last
-            self._log.steps.append(Step(result.stamp_ns, result.status, result.pose,
-                                        result.previous_stamp_ns, result.motion,
-                                        result.motion_covariance, result.scale_known,
-                                        metric=result.metric, keyframe=result.keyframe))
-            self._folder.add_frame(number, result, seconds)
-            if self._draw and (drawing := tracker.drawing()) is not None:
-                self._folder.add_drawing(number, drawing)
-            self._folder.add_landmarks(tracker.settled())
-        else:
-            self._folder.add_unused(number, stamp_ns(message.message.header), tracker.verdict)
-        self._publish(outgoing, message.stamp_ns)
+        # A frame is in all results or in none.
+        with interrupt_after():
+            if tracker.counts.processed > processed and tracker.last is not None:
+                self._record(number, tracker.last, seconds)
+            else:
+                self._folder.add_unused(number, stamp_ns(message.message.header),
+                                        tracker.verdict)
+            self._publish(outgoing, message.stamp_ns)
         if tracker.counts.rejected.total() > rejected:
             self._first_problem = self._first_problem or f'image {number}: {tracker.problem}'
+
+    def _record(self, number: int, result: OdometryResult, seconds: float) -> None:
+        """Keep and write the result of image ``number``."""
+        self._log.steps.append(Step(result.stamp_ns, result.status, result.pose,
+                                    result.previous_stamp_ns, result.motion,
+                                    result.motion_covariance, result.scale_known,
+                                    metric=result.metric, keyframe=result.keyframe))
+        self._folder.add_frame(number, result, seconds)
+        if self._draw and (drawing := self._tracker.drawing()) is not None:
+            self._folder.add_drawing(number, drawing)
+        self._folder.add_landmarks(self._tracker.settled())
 
     def _mount(self, image_frame: str) -> None:
         """Look up the camera on base_frame; DjetError if the recording does not have it."""
@@ -203,8 +211,9 @@ class Replay:
                 "empty (--base-frame '') for the poses of the camera")
 
     def _publish(self, outgoing: list[Outgoing], stamp: int) -> None:
-        for one in outgoing:
-            self._folder.publish(one, stamp)
+        with interrupt_after():
+            for one in outgoing:
+                self._folder.publish(one, stamp)
 
     def _complaint(self) -> str:
         """Return what is wrong with a recording that was read to its end, or ''."""

@@ -27,6 +27,7 @@ from djet_ros.config.sections import Config, NODE_NAME
 from djet_ros.config.yaml_files import dump_yaml
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
+from djet_ros.interrupts import interrupt_after
 from djet_ros.odometry.messages import KEYFRAME_WORDS
 from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.tracker import Outgoing
@@ -183,16 +184,17 @@ class ResultsFolder(Closing):
 
     def close(self) -> None:
         """Complete the bag and close the files."""
-        try:
-            self._table.close()
-            for trajectory in self._trajectories:
-                trajectory.close()
-            if self._landmarks is not None:
-                self._landmarks.close()
-        except OSError as error:
-            raise _blame(self.path, error) from error
-        finally:
-            self._bag.close()
+        with interrupt_after():
+            try:
+                self._table.close()
+                for trajectory in self._trajectories:
+                    trajectory.close()
+                if self._landmarks is not None:
+                    self._landmarks.close()
+            except OSError as error:
+                raise _blame(self.path, error) from error
+            finally:
+                self._bag.close()
 
     def _row(self, values: tuple[Any, ...]) -> None:
         try:
