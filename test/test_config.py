@@ -257,6 +257,20 @@ def test_a_key_that_stands_twice_is_refused_with_its_lines(tmp_path, text, messa
         load_yaml(written(tmp_path, text))
 
 
+@pytest.mark.parametrize('text', [
+    'odometry.max_lost: 7\nodometry: {max_lost: 8}',
+    '/**:\n  ros__parameters:\n    odometry: {max_lost: 8}\n    odometry.max_lost: 7'])
+def test_a_parameter_nested_and_by_its_flat_name_is_refused(tmp_path, text):
+    with pytest.raises(DjetError, match="'odometry.max_lost' is given twice"):
+        load_yaml(written(tmp_path, text))
+
+
+def test_the_later_of_two_matching_nodes_overrides_as_in_ros(tmp_path):
+    text = ('/**: {ros__parameters: {odometry.max_lost: 7}}\n'
+            'vo_node: {ros__parameters: {odometry: {max_lost: 8}}}')
+    assert load_yaml(written(tmp_path, text)).odometry.max_lost == 8
+
+
 def test_what_a_mapping_merges_may_be_overridden(tmp_path):
     text = ('odometry: &one {max_lost: 7, max_gap: 2}\n'
             'vo_node: {ros__parameters: {odometry: {<<: *one, max_gap: 3}}}')

@@ -157,6 +157,7 @@ def test_the_command_renders_measures_and_resumes(tmp_path: Path) -> None:
     (('--scenes', 'road', '--seeds', '5-3'), "'5-3'"),
     (('--scenes', 'road', '--seeds', '1-2-3'), "'1-2-3'"),
     (('--scenes', 'road', '--seeds', '0-3,2'), "'0-3,2' is not a list of different seeds"),
+    (('--scenes', 'road', '--seeds', '0-99999999999'), "'0-99999999999' has more than"),
     (('--scenes', 'road,blur,road'), "scene 'road' is given twice"),
     (('--scenes', 'road', '--frames', 1), '--frames is 1'), (('nowhere',), 'nowhere')])
 def test_user_errors_are_one_line_and_exit_code_2(

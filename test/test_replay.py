@@ -674,6 +674,13 @@ def test_recording_without_tracked_pairs_gives_a_warning(tmp_path):
     assert found['failures'] == FRAMES - 1
 
 
+def test_a_recording_of_one_image_gives_a_warning(tmp_path):
+    source, _ = seen(tmp_path, [Cards().gray(np.eye(4))])
+    done = djet('replay', source, '--output', tmp_path / 'out')
+    assert done.stderr == ('djet: warning: only one image was used, so no motion was estimated: '
+                           'that takes two images\n')
+
+
 @pytest.mark.slow
 def test_stationary_camera_gives_a_warning(tmp_path):
     source, _ = seen(tmp_path, [Cards().gray(np.eye(4))] * FRAMES)

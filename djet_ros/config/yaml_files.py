@@ -46,7 +46,7 @@ def load_yaml(path: Path, take: Callable[[Config, Mapping[str, Any]], Config] = 
     """
     content = read_yaml(path)
     try:
-        return take(Config(), dict(_flatten(_ours(content, nodes))))
+        return take(Config(), _flattened(_ours(content, nodes)))
     except DjetError as error:
         raise DjetError(f'{path}: {error}') from None
 
@@ -65,8 +65,8 @@ def _ours(content: Any, nodes: Sequence[str]) -> Any:
              if _is_for(name, node)]
     if not found:
         raise DjetError(_for_others((name for name, _ in parts), full))
-    return {key: value for node, parameters in found for key, value in _flatten(parameters)
-            if not is_ros_own(key)
+    return {key: value for node, parameters in found
+            for key, value in _flattened(parameters).items() if not is_ros_own(key)
             and (_last(node) != GRAPH_NAME or key.startswith('slam.'))}
 
 
@@ -127,6 +127,17 @@ def _last(name: str) -> str:
 def is_ros_own(name: str) -> bool:
     """Return whether a parameter is one of every ROS node, such as use_sim_time."""
     return name.partition('.')[0] in _ROS_OWN
+
+
+def _flattened(content: Any) -> dict[str, Any]:
+    """Return values by flat name; DjetError if one is given nested and by its flat name."""
+    values: dict[str, Any] = {}
+    for name, value in _flatten(content):
+        if name in values:
+            raise DjetError(f"'{name}' is given twice, in its section and by its flat name; "
+                            'remove one')
+        values[name] = value
+    return values
 
 
 def _flatten(content: Any) -> Iterator[tuple[str, Any]]:

@@ -117,8 +117,8 @@ class Replay:
         self._evaluate(summary)
         self._folder.finish(summary)
         return Outcome(summary, problem or None, (
-            *self._log.advice(), *self._of_late_info(), *self._of_truth(), *(
-                f'{one.name}: {one.text}' for one in self._tracker.complaints_of_content)))
+            *self._of_one_image(), *self._log.advice(), *self._of_late_info(), *self._of_truth(),
+            *(f'{one.name}: {one.text}' for one in self._tracker.complaints_of_content)))
 
     def _take(self, message: BagMessage) -> None:
         """Take one message, and process the images that waited for it."""
@@ -244,6 +244,11 @@ class Replay:
             self._recording.image_topic, self._recording.info_topic))
         return '' if image is None or info is None else (
             f'the first one was recorded {(info - image) * 1e-9:.3f} s after the first image')
+
+    def _of_one_image(self) -> list[str]:
+        """Return a warning if only one image was used."""
+        return [] if self._tracker.counts.processed != 1 else [
+            'only one image was used, so no motion was estimated: that takes two images']
 
     def _of_late_info(self) -> list[str]:
         """Return a warning if images were recorded before the first CameraInfo."""
