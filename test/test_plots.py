@@ -1,4 +1,4 @@
-"""Plots of an evaluation show errors as they are."""
+"""Plots show errors as they are, and the path with what is around it."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from djet_ros.core.types import Status
 from djet_ros.lab import plots
 from djet_ros.lab.pairs import PairRecord
 from djet_ros.lab.style import figure
+from djet_ros.replay.results import plot_trajectory
 from matplotlib.figure import Figure
 import numpy as np
 import pytest
@@ -43,3 +44,20 @@ def kept(drawn: dict[str, Figure]) -> Any:
             drawn[path.name] = empty
             yield empty
     return keeping
+
+
+@pytest.mark.parametrize(('far', 'right'), [(8.0, 8.0), (50.0, 20.0)])
+def test_a_trajectory_is_shown_with_landmarks_up_to_its_own_extent_away(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch, far: float, right: float) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(Figure, 'savefig', lambda one, *_, **__: drawn.append(one))
+    path = np.linspace([0.0, 0.0, 0.0], [0.0, 0.0, 20.0], 9)
+    landmarks = np.tile(np.float32([far, 10.0]), (100, 1))
+    # Some of the landmarks are wrong.
+    landmarks[:3] = -1e6
+    plot_trajectory(tmp_path / 'path.png', path, None, landmarks, 'road', 'm')
+    axes, = drawn[0].axes
+    left, shown = axes.get_xlim()
+    assert right < shown < 1.2 * right + 2 and -6 < left < -1
+    bottom, top = axes.get_ylim()
+    assert -5 < bottom < -1 and 21 < top < 25

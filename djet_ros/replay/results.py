@@ -225,13 +225,21 @@ def _blame(path: Path, error: OSError) -> DjetError:
                      'here are readable')
 
 
-def _widen(axes: Any) -> None:
-    """Widen the plot of a straight trajectory, so that its deviations are visible."""
-    limits = [np.array(axes.get_xlim()), np.array(axes.get_ylim())]
-    longest = max(float(np.ptp(limit)) for limit in limits)
-    for limit, widen in zip(limits, (axes.set_xlim, axes.set_ylim)):
-        half = max(float(np.ptp(limit)), longest / 2) / 2 * 1.1
-        widen(limit.mean() - half, limit.mean() + half)
+def _choose_limits(axes: Any, landmarks: NDArray[np.float32]) -> None:
+    """
+    Show the path and most landmarks (M, 2), those up to the extent of the path away from it.
+
+    A straight path is given a width, so that its deviations are visible.
+    """
+    limits = np.array([axes.get_xlim(), axes.get_ylim()])
+    longest = np.ptp(limits, axis=1).max()
+    if len(landmarks):
+        nearest, farthest = np.quantile(landmarks, (0.05, 0.95), axis=0)
+        limits[:, 0] -= np.clip(limits[:, 0] - nearest, 0, longest)
+        limits[:, 1] += np.clip(farthest - limits[:, 1], 0, longest)
+    halves = np.maximum(np.ptp(limits, axis=1), longest / 2) / 2 * 1.1
+    (left, bottom), (right, top) = limits.mean(1) - halves, limits.mean(1) + halves
+    axes.set(xlim=(left, right), ylim=(bottom, top))
 
 
 def plot_trajectory(path: Path, estimate: Array, truth: Array | None,
@@ -253,8 +261,7 @@ def plot_trajectory(path: Path, estimate: Array, truth: Array | None,
     axes.set(xlabel=f'x, right ({unit})', ylabel=f'z, forward ({unit})')
     # A $ in the name of a folder is not a formula.
     axes.set_title(title, parse_math=False)
-    _widen(axes)
-    # Far landmarks are outside: the path decides what is shown.
+    _choose_limits(axes, landmarks)
     axes.plot(*landmarks.T, ',', color='0.6', zorder=0, scalex=False, scaley=False)
     axes.grid(color='0.9')
     axes.legend(loc='best')
