@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import cv2
@@ -115,15 +116,23 @@ def fractal(rng: np.random.Generator, shape: tuple[int, int], slope: float,
     Frequencies near the sampling limit are damped, so that magnified texels do not show;
     those below ``coarsest`` cycles per texel are cut.
     """
-    height, width = shape
-    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None])
-    frequency = np.asarray(frequency, np.float32)
-    frequency[0, 0] = np.inf
-    gain = frequency ** -slope * np.exp(-(frequency / 0.33) ** 4)
-    gain[frequency < coarsest] = 0.0
+    gain = _gain(shape, slope, coarsest)
     spectrum = rng.standard_normal((*gain.shape, 2), np.float32).view(np.complex64)[..., 0]
     noise = scipy.fft.irfft2(spectrum * gain, s=shape)
     return np.asarray(noise / noise.std(), np.float32)
+
+
+@lru_cache(maxsize=16)
+def _gain(shape: tuple[int, int], slope: float, coarsest: float) -> Gray:
+    """Amplitudes (H, W / 2 + 1) of the frequencies of such noise, of which scenes draw many."""
+    height, width = shape
+    # Negative frequencies are as strong as positive ones.
+    vertical = np.abs(np.fft.fftfreq(height)[:height // 2 + 1, None])
+    frequency = np.asarray(np.hypot(vertical, np.fft.rfftfreq(width)[None]), np.float32)
+    frequency[0, 0] = np.inf
+    gain = frequency ** -slope * np.exp(-(frequency / 0.33) ** 4)
+    gain[frequency < coarsest] = 0.0
+    return np.concatenate([gain, gain[(height - 1) // 2:0:-1]])
 
 
 def _level_sizes(length: int) -> Gray:
