@@ -901,6 +901,7 @@ def mcap_of(records, times):
             + record_of(15, bytes(4)) + record_of(2, bytes(20)) + b'\x89MCAP0\r\n')
 
 
+@pytest.mark.slow
 def test_chunks_that_unpack_to_more_than_memory_holds_are_refused(tmp_path):
     """All of them begin at the same time, so that none is done before the last was read."""
     message = struct.pack('<HIQQ', 1, 0, 1, 1)

@@ -58,6 +58,7 @@ def street() -> ScenePair:
     return render_pair('road', 12, size=(620, 188))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('name', NAMES)
 @pytest.mark.parametrize('scene', ['road', 'forest', 'handheld'])
 def test_a_chain_finds_exact_motion_to_a_fraction_of_a_degree(name: str, scene: str) -> None:

@@ -109,6 +109,7 @@ def trials(motion, loss):
     return seen, results
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('motion', MOTIONS)
 def test_reprojection_error_reaches_the_cramer_rao_bound(motion):
     seen, results = trials(motion, 'none')
@@ -346,6 +347,7 @@ def test_descriptors_recover_rotation_to_a_hundredth_of_a_degree_on_rendered_fra
     assert errors[:, 0].max() < 0.03
 
 
+@pytest.mark.slow
 def test_descriptors_do_better_than_points_with_the_same_matches_on_rendered_frames():
     errors = {method: pair_errors(preset('best', method=method), *drive('road', 8))
               for method in ('djet', 'rpe', 'five_point')}
@@ -595,6 +597,7 @@ def test_two_poses_of_equal_cost_are_ambiguous(kitti: Path):
     assert squared_distance(result.covariance_5, off) < CHI2_999
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('preset_name', ['best', 'fast', 'paper'])
 def test_on_real_frames_descriptors_do_better_than_points(kitti: Path, preset_name):
     sequence = KittiSequence(kitti / 'sequences/06', start=20, end=29)

@@ -101,6 +101,7 @@ def test_the_size_of_a_figure_follows_its_content(road, tmp_path, capsys):
     assert capsys.readouterr().out.splitlines()[0] == f'figure: {few}'
 
 
+@pytest.mark.slow
 def test_an_animation_has_a_frame_for_each_round(road, tmp_path, capsys):
     moving, still = tmp_path / 'surfaces.gif', tmp_path / 'surfaces.png'
     assert lab(['surfaces', str(road), '--pair', '1', '--output', str(moving)]) == 0

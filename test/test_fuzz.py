@@ -47,6 +47,7 @@ def test_damaged_input_gives_a_result_or_an_error_of_ours(name, little_memory):
         target.run(data)
 
 
+@pytest.mark.slow
 def test_only_safe_loading_and_no_code_from_data():
     forbidden = {'pickle', 'cPickle', 'dill', 'marshal', 'shelve', 'joblib', 'cloudpickle'}
     for path in Path(djet_ros.__file__).parent.rglob('*.py'):

@@ -115,6 +115,7 @@ def test_every_package_has_its_place_in_the_order() -> None:
     assert rooms == set(FLOOR)
 
 
+@pytest.mark.slow
 def test_no_module_imports_from_a_package_above_or_next_to_its_own() -> None:
     assert not upward(all_imports())
 
@@ -165,6 +166,7 @@ def test_a_missing_module_of_ros_names_the_package_in_package_xml() -> None:
     assert {str(package).replace('-', '_') for package in asked} <= ROS_LIBRARIES
 
 
+@pytest.mark.slow
 def test_a_live_node_loads_nothing_that_reads_recordings_draws_or_fills_terminals() -> None:
     # Ubuntu has no rosbags: a robot is to do without.
     done = subprocess.run(

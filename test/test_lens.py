@@ -205,6 +205,7 @@ def test_a_correct_calibration_is_kept(
     assert [path.name for path in tmp_path.iterdir()] == ['lens.png']
 
 
+@pytest.mark.slow
 def test_a_wrong_calibration_is_detected_and_corrected(
         distorted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / 'lens'
@@ -222,6 +223,7 @@ def test_a_wrong_calibration_is_detected_and_corrected(
     assert (output / 'lens.png').read_bytes().startswith(b'\x89PNG')
 
 
+@pytest.mark.slow
 def test_a_wrong_row_of_a_calib_txt_is_recognised_by_the_right_one(
         distorted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wrong = with_row(distorted, tmp_path, 'D: 0.01 0 0 0 0')
@@ -278,6 +280,7 @@ def raw_bag(distorted: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bag
 
 
+@pytest.mark.slow
 def test_raw_images_give_a_calibration_file_for_the_driver(
         raw_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['lens', str(raw_bag), '--output', str(tmp_path / 'out')]) == 0

@@ -660,6 +660,7 @@ def closed(drive, tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_slam_command_closes_loops_of_a_recording(closed):
     report = json.loads((closed / 'slam.json').read_text())
     assert (report['scale'], report['scale_kind'], report['scale_uncertainty']) == (

@@ -157,6 +157,7 @@ def test_a_pair_without_inliers_follows_no_body_more_than_another():
     assert of_followed_body(pair, pair.y).all()
 
 
+@pytest.mark.slow
 def test_while_a_lorry_is_overtaken_the_camera_keeps_its_own_motion():
     """The lorry moves along the same road, and has up to two thirds of the matches."""
     scene, estimator = make_scene('motorway', seed=1), TwoViewEstimator()
