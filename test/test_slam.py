@@ -626,6 +626,17 @@ def test_alignment_undoes_any_motion_and_scale():
 
 # The command
 
+@pytest.fixture(scope='module', autouse=True)
+def without_evo():
+    """Do without evo, whose six processes take most of the time of a run: see test_loop.py."""
+    def absent(*_):
+        raise DjetError('evo is left out of these tests')
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr('djet_ros.lab.slam_report.trajectory_metrics', absent)
+        yield
+
+
 @pytest.fixture(scope='module')
 def drive(tmp_path_factory):
     """Return a KITTI sequence of a path to the right and back, past cards."""

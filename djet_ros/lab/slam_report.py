@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 import json
 from pathlib import Path
@@ -64,8 +65,12 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
         summary['errors'] = {label: _error(poses, truth, slam.metric)
                              for label, poses in trajectories.items()}
         try:
-            for label, errors in summary['errors'].items():
-                errors.update(_evo(folder, label, slam.metric))
+            # in parallel, as it takes seconds to start
+            with ThreadPoolExecutor(len(trajectories)) as threads:
+                found = list(threads.map(lambda label: _evo(folder, label, slam.metric),
+                                         trajectories))
+            for label, errors in zip(trajectories, found):
+                summary['errors'][label].update(errors)
         except DjetError as error:
             # evo is not installed, or fails on a straight trajectory.
             summary['evo'] = str(error)
