@@ -208,8 +208,9 @@ def test_a_reader_that_leaves_early_is_no_error(body: str) -> None:
 
 
 # Ends, unless a signal handler waits for the call that it interrupted.
+# By default a thread that waits for the interpreter waits for 5 ms, between any two signals.
 SIGNALS = """
-import os, signal, time
+import os, signal, sys, time
 from threading import Thread
 from djet_ros.cli.graph_options import stop_by_signal
 
@@ -218,6 +219,7 @@ def send():
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(2e-4)
 
+sys.setswitchinterval(1e-4)
 stop = stop_by_signal()
 sender = Thread(target=send)
 sender.start()
