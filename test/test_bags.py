@@ -356,6 +356,25 @@ def test_results_of_a_killed_process_are_readable(tmp_path):
     assert [m.stamp_ns for m in delivered] == [i // 2 + 1 for i in range(len(delivered))]
 
 
+def test_a_bag_that_does_not_fit_is_closed_and_readable(tmp_path):
+    bag, written = ResultBag(tmp_path / 'bag'), 0
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # As a full disk, for this process.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    try:
+        with pytest.raises(DjetError, match='could not be written'):
+            for written in range(1, 1000):
+                bag.write('pose', pose(written), written)
+        with pytest.raises(DjetError, match='could not be written'):
+            bag.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    opened = [os.path.realpath(path) for path in Path('/proc/self/fd').iterdir()]
+    assert not any(path.startswith(str(tmp_path)) for path in opened)
+    delivered, _ = read_until_broken(tmp_path / 'bag')
+    assert 10 < written - 10 < len(delivered) < written
+
+
 def test_the_command_converts(small_kitti, tmp_path, capsys):
     arguments = ['kitti-to-bag', str(small_kitti(frames=6)), str(tmp_path / 'out'), '--storage',
                  'sqlite3', '--start', '1', '--end', '4']

@@ -8,7 +8,7 @@ sqlite3). The same input gives the same bytes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 import sqlite3
 from typing import Any
@@ -105,9 +105,14 @@ class ResultBag(Closing):
             _write(self._writer, topic, message, stamp_ns)
 
     def close(self) -> None:
-        """Write the index and the metadata."""
+        """Write the index and the metadata; the file is closed even if they do not fit."""
         with self._naming_errors():
-            self._writer.close()
+            try:
+                self._writer.close()
+            except OSError:
+                with suppress(OSError):  # that of what could not be written
+                    self._writer.abort()
+                raise
 
     def _flush(self) -> None:
         # rosbags offers no flush; its MCAP storage keeps an open chunk in memory.
