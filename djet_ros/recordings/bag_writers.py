@@ -110,8 +110,11 @@ class ResultBag(Closing):
             try:
                 self._writer.close()
             except OSError:
+                # rosbags leaves its file open, and only its newer versions offer to close it.
+                storage: Any = self._writer.storage
                 with suppress(OSError):  # that of what could not be written
-                    self._writer.abort()
+                    if storage is not None:
+                        storage.bio.close()
                 raise
 
     def _flush(self) -> None:
