@@ -8,7 +8,7 @@ import signal
 from threading import current_thread, main_thread
 
 # Ctrl-C, an orderly end, and the end of the terminal.
-ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @contextmanager
@@ -20,7 +20,7 @@ def interrupt_after() -> Iterator[None]:
         return
     seen: list[int] = []
     before = {number: signal.signal(number, lambda number, _: seen.append(number))
-              for number in ENDING}
+              for number in _ENDING}
     try:
         yield
     finally:

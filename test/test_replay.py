@@ -944,7 +944,7 @@ def test_interrupted_run_is_readable_and_marked_incomplete(folder, tmp_path, sig
 
 @pytest.mark.slow
 def test_a_signal_within_a_write_waits_until_the_frame_is_in_all_results(folder, tmp_path):
-    """The signal comes at each place in turn where rosbags writes the third odometry."""
+    """The signal comes at several places within what rosbags writes of a frame."""
     within = """
 import signal, sys
 from djet_ros.cli.main import main

@@ -132,7 +132,7 @@ def is_ros_own(name: str) -> bool:
 def _flattened(content: Any) -> dict[str, Any]:
     """Return values by flat name; DjetError if one is given nested and by its flat name."""
     values: dict[str, Any] = {}
-    for name, value in _flatten(content):
+    for name, value in _flat_items(content):
         if name in values:
             raise DjetError(f"'{name}' is given twice, in its section and by its flat name; "
                             'remove one')
@@ -140,7 +140,7 @@ def _flattened(content: Any) -> dict[str, Any]:
     return values
 
 
-def _flatten(content: Any) -> Iterator[tuple[str, Any]]:
+def _flat_items(content: Any) -> Iterator[tuple[str, Any]]:
     """Yield flat names and values; only one level is entered, so the depth is bounded."""
     if not isinstance(content, dict):
         raise DjetError(f'expected a mapping of parameters, but found {shown(content)}')

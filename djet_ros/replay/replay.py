@@ -117,7 +117,7 @@ class Replay:
         self._evaluate(summary)
         self._folder.finish(summary)
         return Outcome(summary, problem or None, (
-            *self._of_one_image(), *self._log.advice(), *self._of_late_info(), *self._of_truth(),
+            *self._log.advice(), *self._of_late_info(), *self._of_truth(),
             *(f'{one.name}: {one.text}' for one in self._tracker.complaints_of_content)))
 
     def _take(self, message: BagMessage) -> None:
@@ -159,7 +159,9 @@ class Replay:
     def _info(self, message: BagMessage) -> None:
         tracker = self._tracker
         rejected = tracker.counts.rejected_infos.total()
-        self._publish(tracker.camera_info(message.message), message.stamp_ns)
+        outgoing = tracker.camera_info(message.message)
+        with interrupt_after():
+            self._publish(outgoing, message.stamp_ns)
         if tracker.counts.rejected_infos.total() > rejected:
             self._first_problem = self._first_problem or str(tracker.problem)
 
@@ -211,9 +213,8 @@ class Replay:
                 "empty (--base-frame '') for the poses of the camera")
 
     def _publish(self, outgoing: list[Outgoing], stamp: int) -> None:
-        with interrupt_after():
-            for one in outgoing:
-                self._folder.publish(one, stamp)
+        for one in outgoing:
+            self._folder.publish(one, stamp)
 
     def _complaint(self) -> str:
         """Return what is wrong with a recording that was read to its end, or ''."""
@@ -244,11 +245,6 @@ class Replay:
             self._recording.image_topic, self._recording.info_topic))
         return '' if image is None or info is None else (
             f'the first one was recorded {(info - image) * 1e-9:.3f} s after the first image')
-
-    def _of_one_image(self) -> list[str]:
-        """Return a warning if only one image was used."""
-        return [] if self._tracker.counts.processed != 1 else [
-            'only one image was used, so no motion was estimated: that takes two images']
 
     def _of_late_info(self) -> list[str]:
         """Return a warning if images were recorded before the first CameraInfo."""

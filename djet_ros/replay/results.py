@@ -234,9 +234,9 @@ def _choose_limits(axes: Any, landmarks: NDArray[np.float32]) -> None:
     limits = np.array([axes.get_xlim(), axes.get_ylim()])
     longest = np.ptp(limits, axis=1).max()
     if len(landmarks):
-        nearest, farthest = np.quantile(landmarks, (0.05, 0.95), axis=0)
-        limits[:, 0] -= np.clip(limits[:, 0] - nearest, 0, longest)
-        limits[:, 1] += np.clip(farthest - limits[:, 1], 0, longest)
+        lowest, highest = np.quantile(landmarks, (0.05, 0.95), axis=0)
+        limits[:, 0] -= np.clip(limits[:, 0] - lowest, 0, longest)
+        limits[:, 1] += np.clip(highest - limits[:, 1], 0, longest)
     halves = np.maximum(np.ptp(limits, axis=1), longest / 2) / 2 * 1.1
     (left, bottom), (right, top) = limits.mean(1) - halves, limits.mean(1) + halves
     axes.set(xlim=(left, right), ylim=(bottom, top))

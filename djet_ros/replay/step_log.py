@@ -70,9 +70,11 @@ class StepLog:
                 'continues at the last pose, without the motion in the gap']
 
     def _of_pairs(self) -> list[str]:
-        """Return a warning if no pair was tracked, or none has a translation."""
+        """Return a warning if there is no pair, none was tracked, or none has a translation."""
         pairs = self.pairs()
         statuses = Counter(step.status for step in pairs)
+        if len(self.steps) == 1:
+            return ['only one image was used, so no motion was estimated: that takes two images']
         if not pairs:
             return [] if not self.jumps() else [
                 f'none of {len(self.steps)} images could be paired with the one before: the time '

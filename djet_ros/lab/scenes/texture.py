@@ -126,13 +126,12 @@ def fractal(rng: np.random.Generator, shape: tuple[int, int], slope: float,
 def _gain(shape: tuple[int, int], slope: float, coarsest: float) -> Gray:
     """Amplitudes (H, W / 2 + 1) of the frequencies of such noise, of which scenes draw many."""
     height, width = shape
-    # Negative frequencies are as strong as positive ones.
-    vertical = np.abs(np.fft.fftfreq(height)[:height // 2 + 1, None])
-    frequency = np.asarray(np.hypot(vertical, np.fft.rfftfreq(width)[None]), np.float32)
+    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None])
+    frequency = np.asarray(frequency, np.float32)
     frequency[0, 0] = np.inf
     gain = frequency ** -slope * np.exp(-(frequency / 0.33) ** 4)
     gain[frequency < coarsest] = 0.0
-    return np.concatenate([gain, gain[(height - 1) // 2:0:-1]])
+    return np.asarray(gain)
 
 
 def _level_sizes(length: int) -> Gray:
