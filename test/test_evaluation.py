@@ -329,6 +329,19 @@ def test_a_bag_gives_the_errors_of_the_folder_that_it_was_made_of(road, tmp_path
     assert not list((tmp_path / 'results').glob('.frames*'))
 
 
+def test_a_bag_cut_short_is_evaluated_up_to_the_cut(road, tmp_path):
+    write_kitti_bag(KittiSequence(road, end=4), tmp_path / 'bag')
+    file = tmp_path / 'bag' / 'bag.mcap'
+    file.write_bytes(file.read_bytes()[:-file.stat().st_size // 3])
+    answer = djet('evaluate', tmp_path / 'bag', '--methods', 'djet', '--presets', 'best',
+                  '--workers', '1', '--output', tmp_path / 'results')
+    assert answer.returncode == 0
+    warned, = (line for line in answer.stderr.splitlines() if line.startswith('djet: warning'))
+    assert 'cut short' in warned
+    row, = rows(tmp_path / 'results' / 'table1.csv')
+    assert 0 < int(row['pairs']) < 3
+
+
 def test_frames_are_chosen_by_start_end_and_stride(road, tmp_path):
     source, = open_datasets([road], Selection(1, 8, 3), tmp_path)
     assert list(source.frames) == [1, 4, 7]

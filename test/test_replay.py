@@ -717,7 +717,7 @@ def test_truncated_bag_is_used_up_to_the_cut(bag, tmp_path):
     whole = next(bag.glob('*.mcap')).read_bytes()
     cut.write_bytes(whole[:len(whole) * 6 // 10])
     results = tmp_path / 'results'
-    printed = djet('replay', cut, '--output', results, expect=2).stderr
+    printed = djet('replay', cut, '--scale', 'ground_truth', '--output', results, expect=2).stderr
     assert len(printed.splitlines()) == 1
     assert 'cut short' in printed
     found = summary(results)

@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
         make_folder(args.output)
         with progress_bar('frames') as progress:
             slam = run_slam(steps, source, config, progress, args.output)
-        truth = GroundTruth.of(source).at(slam.frames.stamps_ns)
+        truth = GroundTruth.of(source, warn).at(slam.frames.stamps_ns)
     finally:
         source.close()
     make_room(args.output, FILES, args.overwrite)

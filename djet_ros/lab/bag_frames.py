@@ -11,7 +11,7 @@ from djet_ros.odometry.camera import Camera, is_rectified
 from djet_ros.odometry.images import gray_image
 from djet_ros.odometry.messages import pose_of, stamp_ns
 from djet_ros.recordings.frame_sequence import FrameSequence, ImageFiles
-from djet_ros.recordings.recording import BagRecording
+from djet_ros.recordings.recording import BagRecording, refuse, up_to_damage, Warn
 from djet_ros.replay.ground_truth import GroundTruth
 import numpy as np
 from numpy.typing import NDArray
@@ -41,17 +41,18 @@ def is_extracted(folder: Path) -> bool:
     return (folder / _INDEX).exists()
 
 
-def extract(recording: BagRecording, folder: Path) -> Path:
+def extract(recording: BagRecording, folder: Path, warn: Warn = refuse) -> Path:
     """
     Extract the frames of a bag, rectified, to a new folder, with the ground truth at their stamps.
 
-    Returns the folder. Raises DjetError if the bag has no usable frames.
+    warn: called with the damage of a bag, which ends there. Returns the folder; raises DjetError
+    if the bag has no usable frames.
     """
     folder.mkdir(parents=True)
     camera: Camera | None = None
     stamps: list[int] = []
     truth = GroundTruth()
-    for topic, _, message in recording.messages():
+    for topic, _, message in up_to_damage(recording.messages(), warn):
         if topic == recording.info_topic:
             camera = camera or Camera.from_info(
                 message, is_rectified('auto', recording.image_topic))

@@ -24,6 +24,7 @@ from djet_ros.core.types import Array, RelativePose, View
 from djet_ros.errors import DjetError
 from djet_ros.lab.sequences import readable_frames
 from djet_ros.recordings.frame_sequence import FrameSequence
+from djet_ros.recordings.recording import refuse, Warn
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,16 +41,18 @@ Key = TypeVar('Key')
 
 
 def bench(source: Path, pairs: int,
-          progress: Callable[[str], None] = lambda stage: None) -> dict[str, Any]:
+          progress: Callable[[str], None] = lambda stage: None,
+          warn: Warn = refuse) -> dict[str, Any]:
     """
     Measure the first pairs of a recording with one thread, then with OpenCV's default number.
 
     Returns the results of the single-threaded run, and those of the other under 'all_cores'.
     The frames of a bag are extracted first, so that decoding costs the same as for a folder.
-    Raises DjetError if the source is no recording of at least two frames.
+    warn: called with the damage of a bag, which ends there. Raises DjetError if the source is no
+    recording of at least two frames.
     """
     with TemporaryDirectory(prefix='djet-') as workspace:
-        sequence = readable_frames(source, Path(workspace))
+        sequence = readable_frames(source, Path(workspace), warn)
         if len(sequence) < 2:
             raise DjetError(f'{source} has {len(sequence)} frames; at least 2 are needed')
         progress('one thread')

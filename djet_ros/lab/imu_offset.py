@@ -10,11 +10,11 @@ from djet_ros.config.sections import Config
 from djet_ros.core.geometry import rotation_log
 from djet_ros.core.types import Array, TRACKED
 from djet_ros.errors import DjetError
-from djet_ros.lab.processed import processed, refuse
+from djet_ros.lab.processed import processed
 from djet_ros.odometry.messages import stamp_ns
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.recordings.decoding import message_type
-from djet_ros.recordings.recording import Recording
+from djet_ros.recordings.recording import Recording, refuse, Warn
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -71,7 +71,7 @@ class ImuFit:
 
 
 def rotations_and_rates(recording: Recording, config: Config, advance: Callable[[], None],
-                        warn: Callable[[str], None] = refuse
+                        warn: Warn = refuse
                         ) -> tuple[VisualRotations, NDArray[np.int64], Array]:
     """
     Return the rotations between images, and stamps (M,) in ns and rates (M, 3) of the gyro.

@@ -18,13 +18,13 @@ from djet_ros.core.lens import (
 )
 from djet_ros.core.types import Array, RelativePose, Status
 from djet_ros.errors import DjetError
-from djet_ros.lab.processed import processed, refuse
+from djet_ros.lab.processed import processed
 from djet_ros.lab.style import COLOURS, figure
 from djet_ros.odometry.camera import Camera, is_rectified
 from djet_ros.odometry.tracker import Tracker
 from djet_ros.recordings.decoding import message_type
 from djet_ros.recordings.mask_files import static_mask
-from djet_ros.recordings.recording import Recording
+from djet_ros.recordings.recording import Recording, refuse, Warn
 import numpy as np
 import yaml
 
@@ -91,7 +91,7 @@ class LensReport:
 
 
 def examine(recording: Recording, config: Config, advance: Callable[[], None],
-            warn: Callable[[str], None] = refuse) -> LensReport:
+            warn: Warn = refuse) -> LensReport:
     """
     Run a recording through the odometry, and estimate the coefficient k1 from its pairs.
 
@@ -166,7 +166,7 @@ def _tracker(recording: Recording, config: Config) -> Tracker:
 
 
 def _pairs(recording: Recording, config: Config, advance: Callable[[], None],
-           warn: Callable[[str], None]) -> Iterator[_Pair]:
+           warn: Warn) -> Iterator[_Pair]:
     """Yield the pairs of a recording; raise DjetError if the camera changes."""
     tracker = _tracker(recording, config)
     camera: Camera | None = None

@@ -8,17 +8,11 @@ from typing import Any
 from djet_ros.errors import DjetError
 from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.tracker import Tracker
-from djet_ros.recordings.bags import BagMessage
-from djet_ros.recordings.recording import Recording
-
-
-def refuse(damage: str) -> None:
-    """Raise DjetError, where a damaged recording is of no use."""
-    raise DjetError(damage)
+from djet_ros.recordings.recording import Recording, up_to_damage, Warn
 
 
 def processed(recording: Recording, tracker: Tracker, advance: Callable[[], None],
-              take: Callable[[str, Any], None], warn: Callable[[str], None]
+              take: Callable[[str, Any], None], warn: Warn
               ) -> Iterator[OdometryResult]:
     """
     Run a recording through the odometry; yield the result of each frame that it processes.
@@ -27,7 +21,7 @@ def processed(recording: Recording, tracker: Tracker, advance: Callable[[], None
     warn: called with the damage of a recording, which ends there. Raises DjetError if a CameraInfo
     is invalid, or no image comes after one.
     """
-    for topic, _, message in _up_to_damage(recording, warn):
+    for topic, _, message in up_to_damage(recording.messages(), warn):
         if topic != recording.image_topic:
             take(topic, message)
         if topic == recording.info_topic:
@@ -44,10 +38,3 @@ def processed(recording: Recording, tracker: Tracker, advance: Callable[[], None
         raise tracker.problem or DjetError(
             f'none of {tracker.counts.received} images came after a CameraInfo on '
             f'{recording.info_topic}; record it too, or choose one with --info-topic')
-
-
-def _up_to_damage(recording: Recording, warn: Callable[[str], None]) -> Iterator[BagMessage]:
-    try:
-        yield from recording.messages()
-    except DjetError as damage:
-        warn(str(damage))

@@ -17,7 +17,7 @@ from djet_ros.lab.scenes.sequence import rendered_scene
 from djet_ros.recordings.bags import is_bag
 from djet_ros.recordings.datasets import open_sequence
 from djet_ros.recordings.frame_sequence import FrameSequence
-from djet_ros.recordings.recording import BagRecording
+from djet_ros.recordings.recording import BagRecording, refuse, Warn
 import numpy as np
 from numpy.typing import NDArray
 
@@ -58,17 +58,19 @@ class Dataset:
         return {'name': self.name, 'frames': frames, 'content': self.content}
 
 
-def open_datasets(paths: Iterable[Path], selection: Selection, workspace: Path) -> list[Dataset]:
+def open_datasets(paths: Iterable[Path], selection: Selection, workspace: Path,
+                  warn: Warn = refuse) -> list[Dataset]:
     """
     Open datasets, each sequence of a KITTI folder separately, and check that all are usable.
 
-    The frames of bags are extracted to the workspace, for random access. Raises DjetError on paths
-    that are no dataset, or have no ground truth or too few frames.
+    The frames of bags are extracted to the workspace, for random access. warn: called with the
+    damage of a bag, which ends there. Raises DjetError on paths that are no dataset, or have no
+    ground truth or too few frames.
     """
     datasets: list[Dataset] = []
     for path in chain.from_iterable(map(_sequences, paths)):
         name = _unused(plain_name(path), {dataset.name for dataset in datasets})
-        datasets.append(_dataset(path, name, selection, workspace))
+        datasets.append(_dataset(path, name, selection, workspace, warn))
     return datasets
 
 
@@ -84,10 +86,10 @@ def _frames_in(folder: Path) -> FrameSequence:
     return open_sequence(folder)
 
 
-def pair_of_frames(path: Path, index: int, workspace: Path
+def pair_of_frames(path: Path, index: int, workspace: Path, warn: Warn = refuse
                    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Array]:
     """Return the images (H, W) of frames index and index + 1 of any dataset, and K (3, 3)."""
-    sequence = readable_frames(path, workspace)
+    sequence = readable_frames(path, workspace, warn)
     if len(sequence) < 2:
         raise DjetError(f'{path} has one image; name a recording with two or more')
     if not 0 <= index < len(sequence) - 1:
@@ -95,21 +97,25 @@ def pair_of_frames(path: Path, index: int, workspace: Path
     return sequence.image(index), sequence.image(index + 1), sequence.K
 
 
-def readable_frames(path: Path, workspace: Path) -> FrameSequence:
-    """Open any dataset for random access; frames of a bag are extracted to the workspace."""
-    return _frames_in(_readable(path, workspace / 'frames'))
+def readable_frames(path: Path, workspace: Path, warn: Warn = refuse) -> FrameSequence:
+    """
+    Open any dataset for random access; frames of a bag are extracted to the workspace.
+
+    warn: called with the damage of a bag, which ends there.
+    """
+    return _frames_in(_readable(path, workspace / 'frames', warn))
 
 
-def _readable(path: Path, place: Path) -> Path:
+def _readable(path: Path, place: Path, warn: Warn) -> Path:
     """Return a folder with random access to the frames; those of a bag are extracted there."""
     if not is_bag(path):
         return path.resolve()
     with BagRecording(path) as recording:
-        return extract(recording, place)
+        return extract(recording, place, warn)
 
 
-def _dataset(path: Path, name: str, selection: Selection, workspace: Path) -> Dataset:
-    folder = _readable(path, workspace / name)
+def _dataset(path: Path, name: str, selection: Selection, workspace: Path, warn: Warn) -> Dataset:
+    folder = _readable(path, workspace / name, warn)
     sequence = _frames_in(folder)
     frames = _selected(path, sequence, selection)
     if sequence.poses is None or not _has_true_pair(sequence.poses[frames]):

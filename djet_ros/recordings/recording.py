@@ -8,7 +8,7 @@ would hold, so that all sources pass through the same tracker.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 import re
 from typing import Any
@@ -28,6 +28,9 @@ from djet_ros.recordings.text import lines
 from djet_ros.recordings.trajectories import read_tum
 import numpy as np
 from numpy.typing import NDArray
+
+# Called with what is wrong, in one line.
+Warn = Callable[[str], None]
 
 IMAGE_TOPIC = '/camera/image_rect'
 RAW_IMAGE_TOPIC = '/camera/image_raw'
@@ -86,6 +89,19 @@ class Recording(Closing):
     def static_frames(self) -> Iterator[Any]:
         """Yield the TFMessages of /tf_static; raise DjetError if the file is damaged."""
         yield from ()
+
+
+def refuse(damage: str) -> None:
+    """Raise DjetError, where a damaged recording is of no use."""
+    raise DjetError(damage)
+
+
+def up_to_damage(messages: Iterator[BagMessage], warn: Warn) -> Iterator[BagMessage]:
+    """Yield the messages of a recording; if it is damaged, end there and call warn with that."""
+    try:
+        yield from messages
+    except DjetError as damage:
+        warn(str(damage))
 
 
 class SequenceRecording(Recording):

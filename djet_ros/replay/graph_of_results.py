@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 import csv
 import io
 from pathlib import Path
@@ -21,12 +21,11 @@ from djet_ros.posegraph.pose_graph import PoseGraph
 from djet_ros.posegraph.step_messages import rotation_covariance_of
 from djet_ros.posegraph.steps import graph_of, Step
 from djet_ros.recordings.bags import Bag
+from djet_ros.recordings.recording import Warn
 from djet_ros.recordings.trajectories import read_tum
 from djet_ros.replay.results import BAG
 import numpy as np
 
-
-Warn = Callable[[str], None]
 
 # A motion (4, 4) and its covariance (6, 6), in optical axes.
 _Estimate = tuple[Array, Array]

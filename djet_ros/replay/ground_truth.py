@@ -6,7 +6,7 @@ from djet_ros.core.types import Array
 from djet_ros.odometry.interpolation import poses_at
 from djet_ros.odometry.messages import pose_of
 from djet_ros.recordings.datasets import LONGEST_GAP_NS
-from djet_ros.recordings.recording import Recording
+from djet_ros.recordings.recording import Recording, refuse, up_to_damage, Warn
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,11 +18,11 @@ class GroundTruth:
         self._poses: dict[int, Array] = {}
 
     @classmethod
-    def of(cls, recording: Recording) -> GroundTruth:
-        """Read the ground truth of a recording."""
+    def of(cls, recording: Recording, warn: Warn = refuse) -> GroundTruth:
+        """Read the ground truth of a recording, up to its damage; warn: called with that."""
         truth = cls()
-        if recording.ground_truth_topic is not None:
-            for message in recording.messages({recording.ground_truth_topic}):
+        if (topic := recording.ground_truth_topic) is not None:
+            for message in up_to_damage(recording.messages({topic}), warn):
                 truth.add(*pose_of(message.message))
         return truth
 

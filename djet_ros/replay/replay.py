@@ -359,6 +359,7 @@ def _scale(recording: Recording, config: Config) -> ScaleSource:
         raise DjetError(f"odometry.scale is 'ground_truth', but "
                         f'{_several(recording.ground_truth_choices)}')
     if config.odometry.scale == 'ground_truth' and recording.ground_truth_topic is not None:
-        stamps, poses = GroundTruth.of(recording).known()
+        # Damage of the recording is reported when the images are read.
+        stamps, poses = GroundTruth.of(recording, lambda damage: None).known()
         positions = stamps, poses[:, :3, 3]
     return scale_source(config.odometry, positions)

@@ -13,7 +13,7 @@ from djet_ros.cli.options import (
     RECORDINGS,
     write_json,
 )
-from djet_ros.cli.terminal import console, new_table
+from djet_ros.cli.terminal import console, new_table, warn
 from djet_ros.lab.bench import bench, QUOTED_POINTS
 from rich.console import Console
 from rich.table import Table
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     check_least(args, pairs=1)
     with Console(stderr=True).status('measuring ...') as status:
         figures = bench(args.source, args.pairs,
-                        lambda stage: status.update(f'measuring with {stage} ...'))
+                        lambda stage: status.update(f'measuring with {stage} ...'), warn)
     console().print(_table(figures))
     write_json(args.output, figures, lambda plot: draw(figures, plot))
     return 0

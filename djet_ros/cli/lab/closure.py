@@ -16,7 +16,7 @@ from djet_ros.cli.options import (
     split,
     write_json,
 )
-from djet_ros.cli.terminal import console, new_table, progress_bar
+from djet_ros.cli.terminal import console, new_table, progress_bar, warn
 from djet_ros.core.estimator_config import METHODS
 from djet_ros.lab.closure import closures, summary, Triangle
 from djet_ros.lab.methods import check_names, TITLES
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     methods, name = split(args.methods), plain_name(args.source)
     check_names('method', methods, CHOICES)
     with TemporaryDirectory() as workspace:
-        sequence = readable_frames(args.source, Path(workspace))
+        sequence = readable_frames(args.source, Path(workspace), warn)
         with progress_bar('triplets', max(min(args.frames, len(sequence)) - 2, 1)) as progress:
             found = closures(sequence, methods, args.frames, progress)
     summaries = {method: summary(triangles) for method, triangles in found.items()}

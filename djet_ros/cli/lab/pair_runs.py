@@ -13,7 +13,7 @@ import shutil
 from typing import Any
 
 from djet_ros.cli.options import add_frames, add_output, add_workers, check_least
-from djet_ros.cli.terminal import console, progress_bar
+from djet_ros.cli.terminal import console, progress_bar, warn
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.lab.methods import Method
 from djet_ros.lab.pairs import evaluate_chunk, PairRecord
@@ -97,7 +97,7 @@ def datasets_of(args: argparse.Namespace, sources: Sequence[Path], stride: int =
     # Next to the results, which workers on other machines see too.
     workspace = (args.output / f'.frames-{os.getpid()}').resolve()
     try:
-        yield open_datasets(sources, Selection(args.start, args.end, stride), workspace)
+        yield open_datasets(sources, Selection(args.start, args.end, stride), workspace, warn)
     finally:
         shutil.rmtree(workspace, ignore_errors=True)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from djet_ros.cli.options import add_output, check_output, numbers
+from djet_ros.cli.terminal import warn
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
 from djet_ros.core.estimator import TwoViewEstimator
@@ -74,7 +75,7 @@ def _images(args: argparse.Namespace) -> tuple[NDArray[np.uint8], NDArray[np.uin
     """Return two images (H, W) and their camera matrix (3, 3)."""
     if args.other is None:
         with TemporaryDirectory(prefix='djet-') as workspace:
-            return pair_of_frames(args.source, args.pair, Path(workspace))
+            return pair_of_frames(args.source, args.pair, Path(workspace), warn)
     if args.camera is None:
         raise DjetError('two images need --camera FX,FY,CX,CY')
     fx, fy, cx, cy = numbers(args.camera, '--camera', 'FX,FY,CX,CY')
