@@ -26,6 +26,7 @@ from djet_ros.core.geometry import (
     inverse_depths,
     line_distances,
     line_values,
+    norms,
     patch_warp,
     rays,
     slant_warp,
@@ -379,7 +380,7 @@ def _advanced(keypoints: Array, optimum: Array, config: EstimatorConfig) -> Arra
     step = optimum - keypoints
     if config.step == 'share':
         return keypoints + config.step_share * step
-    length = np.linalg.norm(step, axis=1, keepdims=True)
+    length = norms(step)[:, None]
     # Beyond the sampled window the paraboloid is not valid, so no step is longer than that.
     longest = 1.0 if config.step == 'pixel' else config.window / 2
     return np.asarray(keypoints + step * np.minimum(1.0, longest / np.maximum(length, 1e-12)))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from djet_ros.core.covariance import CHI2_999, pose_differences
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import MeasuredRotation
-from djet_ros.core.geometry import fit_rotation
+from djet_ros.core.geometry import fit_rotation, norms
 from djet_ros.core.jet import (
     clipped_scale,
     epipolar_residuals,
@@ -202,7 +202,7 @@ def _is_pure_rotation(problem: JetProblem, parallax: float) -> bool:
     """Return whether a rotation alone brings three quarters of the matches close to y."""
     rays_x, rays_y = problem.rays_x.T, problem.rays_y.T
     rotated = rays_x @ fit_rotation(rays_x, rays_y).T
-    offsets = np.linalg.norm(rotated[:, :2] / rotated[:, 2:] - rays_y[:, :2], axis=1)
+    offsets = norms(rotated[:, :2] / rotated[:, 2:] - rays_y[:, :2])
     # Size of a pixel in viewing-ray units, as for a surface of typical sharpness.
     pixel = np.sqrt(median(np.abs(problem.covariances[0] + problem.covariances[2])) / 2)
     return bool(quantile(offsets, 0.75) < parallax * pixel)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from djet_ros.core.features import match_everywhere, match_nearby
 from djet_ros.core.flow import flow_reach, NEAR_LEVELS, track_features
+from djet_ros.core.geometry import norms
 from djet_ros.core.hamming import match_distances
 from djet_ros.core.paraboloid import quantile
 from djet_ros.core.prediction import (
@@ -85,7 +86,7 @@ def match_predicted(previous: View, current: View, prior: RelativePose | None, k
         return None
     # If many are far from their prediction, as after a step twice as long, others are beyond the
     # search radius.
-    offsets = np.linalg.norm((y - predicted).compress(tracked, axis=0), axis=1)
+    offsets = norms((y - predicted).compress(tracked, axis=0))
     if quantile(offsets, _QUANTILE) > reach / 2:
         return None
     first = _most_similar_first(bits)

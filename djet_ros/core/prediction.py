@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from djet_ros import compiled
 from djet_ros.core.features import signed_bits
-from djet_ros.core.geometry import inverse_depths, rays, unit
+from djet_ros.core.geometry import inverse_depths, norms, rays, unit
 from djet_ros.core.types import Array, Features, RelativePose
 import numpy as np
 from numpy.typing import NDArray
@@ -82,7 +82,7 @@ def search_radius_after(motion: RelativePose, K: Array) -> float:
     """
     x, y = motion.x[motion.inliers], motion.y_opt[motion.inliers]
     rotated = rays(K, x) @ (K @ motion.R).T
-    displacements = np.linalg.norm(rotated[:, :2] / rotated[:, 2:] - y, axis=1)
+    displacements = norms(rotated[:, :2] / rotated[:, 2:] - y)
     if not len(displacements):
         return np.inf
     return _MARGIN + 1.5 * float(np.quantile(displacements, _QUANTILE))

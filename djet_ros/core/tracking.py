@@ -13,6 +13,7 @@ from djet_ros.core.algorithm import Algorithm, ALGORITHM_TUNING, Track
 from djet_ros.core.basins import BASIN_TUNING, likeliest
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import MeasuredRotation
+from djet_ros.core.geometry import norms
 from djet_ros.core.jet import Loss
 from djet_ros.core.pair import Pair
 from djet_ros.core.rivals import (
@@ -147,7 +148,7 @@ def _attached_to_camera(algorithm: Algorithm, track: Track, noise: float
                         ) -> NDArray[np.bool_] | None:
     """Return the matches (N,) on what moves with the camera, None if there are none."""
     pair, first, measured = algorithm.pair, algorithm.first, algorithm.pair.known.rotation
-    fixed = np.linalg.norm(pair.y - pair.x, axis=1) < ALGORITHM_TUNING.inlier * noise
+    fixed = norms(pair.y - pair.x) < ALGORITHM_TUNING.inlier * noise
     world = motion_without_attached(first.problem, fixed[first.voting], track.pose, noise,
                                     algorithm.config.min_matches, pair.prior)
     if world is None or (measured is not None and measured.prefers(track.pose.R, world.R)):

@@ -24,6 +24,7 @@ from djet_ros.core.geometry import (
     fit_rotation,
     fundamental,
     line_distances,
+    norms,
     rays,
     rotation_log,
 )
@@ -292,6 +293,6 @@ def _rotation_alone(K: Array, rays_x: Array, rays_y: Array, y: Array, noise: flo
     R, noise = fit_rotation(rays_x, rays_y), _PARALLAX_OVER_NOISE * noise
     rotated = rays_x @ (K @ R).T
     # The upper quartile.
-    parallax = quantile(np.linalg.norm(y - rotated[:, :2] / rotated[:, 2:], axis=1), 0.75)
+    parallax = quantile(norms(y - rotated[:, :2] / rotated[:, 2:]), 0.75)
     explained = parallax < max(config.min_parallax, noise)
     return _PureRotation(R, parallax >= noise) if explained else None

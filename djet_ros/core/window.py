@@ -32,6 +32,7 @@ from djet_ros.core.bundle import (
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import (
     inverse_depths,
+    norms,
     rotation_exp,
     rotation_log,
     skew,
@@ -472,7 +473,7 @@ class Window:
             H, g = self._prior.H + reduced.H, prior.gradient + reduced.g
             step = np.asarray(-np.linalg.solve(H + np.diag(1e-9 * np.diag(H)), g), float)
             observed, prior = self._line_search(observed, prior, step, reduced.change(step))
-        outliers = np.linalg.norm(observed.residuals, axis=1) > self._tuning.outlier * self._scale
+        outliers = norms(observed.residuals) > self._tuning.outlier * self._scale
         self._landmarks.observed[observed.landmark[outliers], observed.frame[outliers]] = False
         np.subtract.at(self._landmarks.observation_counts, observed.landmark[outliers], 1)
         # Relative to the newest step: the unit may be much longer or shorter.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from djet_ros.core.geometry import norms
 from djet_ros.core.types import Array, RelativePose, Status, TRACKED
 import numpy as np
 from numpy.typing import NDArray
@@ -160,7 +161,7 @@ def _still_and_slightly(relative: RelativePose, threshold: float
 
 
 def _displacements(x: Array, y: Array) -> Array:
-    return np.asarray(np.linalg.norm(y - x, axis=1))
+    return norms(y - x)
 
 
 def _identifiers(x: Array) -> NDArray[np.complex128]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.geometry import norms
 from djet_ros.core.rivals import unsigned_distance
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.starts import KnownMotion
@@ -296,7 +297,7 @@ class VisualOdometry:
         """Return whether the reference is kept until the direction of motion is determined."""
         if pair.status is not Status.NO_PARALLAX or not self._scale.is_new:
             return False
-        displacements = np.linalg.norm(pair.y - pair.x, axis=1)
+        displacements = norms(pair.y - pair.x)
         return bool(np.median(displacements) < _IN_VIEW * max(self._reference.view.gray.shape))
 
     def _refer_to(self, frame: Frame, view: View, pair: RelativePose | None) -> None:
