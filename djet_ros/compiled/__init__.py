@@ -420,7 +420,8 @@ def _ptr(array: NDArray[Any], dtype: Any = _FLOAT64) -> Any:
     ordered = np.ascontiguousarray(array, dtype)
     try:
         # Four times as fast as `ctypes`; there are hundreds of calls per frame.
-        return _NO_BYTES.from_buffer(ordered)
+        # NumPy's types say that arrays are buffers for Python 3.12 and newer only.
+        return _NO_BYTES.from_buffer(ordered)  # type: ignore[arg-type]
     except TypeError:  # read-only arrays
         return ordered.ctypes
 
