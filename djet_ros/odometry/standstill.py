@@ -145,8 +145,7 @@ def _drifted(x: Array, y: Array, least: float) -> bool:
     freedom = 2 * len(x) - 6
     if freedom <= 0:
         return False
-    centred = x - x.mean(0)
-    design = np.column_stack([centred / max(np.abs(centred).max(), 1.0), np.ones(len(x))])
+    design = np.column_stack([x, np.ones(len(x))])
     fit = design @ np.linalg.lstsq(design, y - x, rcond=None)[0]
     drift, noise = float((fit**2).sum()), float(((y - x - fit)**2).sum()) / freedom
     return bool(drift - 6 * noise > len(x) * least**2
