@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from djet_ros.core.fusion import agrees, fused, MeasuredRotation
-from djet_ros.core.geometry import rotation_exp, sphere_tangents
+from djet_ros.core.geometry import (
+    rotation_angle,
+    rotation_exp,
+    rotation_log,
+    sphere_tangents,
+    unit,
+)
 from djet_ros.core.types import Array, RelativePose, Status
 from djet_ros.lab.scenes.imu import feel, Mems, TO_CAMERA
 from djet_ros.lab.scenes.walk import HandHeld
 from djet_ros.odometry.inertial import Gyro, GyroNoise
+from djet_ros.odometry.priors import MotionPriors
+from djet_ros.odometry.uncertainty import compose
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 NOISE = GyroNoise(2e-4, 2e-5)
 SECOND, PERIOD = 10**9, 10**8
@@ -71,6 +81,21 @@ def test_the_jerks_of_a_hand_are_integrated_to_a_hundredth_of_a_degree(seed: int
         assert np.linalg.norm(turn.correction(relative(poses, i, i + 1))) < np.radians(0.01)
 
 
+def test_between_few_samples_an_axis_that_turns_is_integrated_to_the_fourth_order() -> None:
+    """Twenty samples a second of a rate that changes from one axis to another."""
+    gyro, slow, parts = mounted(), 50_000_000, 2000
+    rates = np.array([[2.0, 0.5, 0], [0.5, 2.0, 0], [0, 1.0, 2.0]])
+    turned = np.eye(3)
+    for i, rate in enumerate(rates):
+        gyro.add(i * slow, rate)
+        for share in (np.arange(parts) + 0.5) / parts if i else ():
+            between = rates[i - 1] + share * (rate - rates[i - 1])
+            turned = turned @ rotation_exp(between * slow * 1e-9 / parts)
+    turn = gyro.turn(0, 2 * slow)
+    assert turn is not None
+    assert np.linalg.norm(turn.correction(turned.T)) < 2e-5  # 4e-4 to the second
+
+
 def test_rates_along_the_axes_of_a_robot_are_those_of_its_camera() -> None:
     # To the left about z of the robot is about -y of the camera.
     turn = constant(np.array([0, 0, 0.3]), to_camera=TO_CAMERA).turn(0, SECOND)
@@ -86,6 +111,19 @@ def test_the_clock_offset_shifts_the_stamps() -> None:
     assert turn is not None
     # A rate of 2 t from 0.13 to 0.23 s.
     assert np.allclose(Rotation.from_matrix(turn.R.T).as_rotvec(), [0, 0, 0.23**2 - 0.13**2])
+
+
+@pytest.mark.parametrize('offset_ns', [-30_000_000, 30_000_000])
+def test_images_need_samples_up_to_their_stamp_by_the_clock_of_the_imu(offset_ns: int) -> None:
+    gyro, image = mounted(offset_ns=offset_ns), 5 * PERIOD
+    for stamp in range(0, image + offset_ns, 10_000_000):
+        gyro.add(stamp, np.array([0, 0, 0.5]))
+        assert not gyro.covers(image)
+    gyro.add(image + offset_ns, np.array([0, 0, 0.5]))
+    assert gyro.covers(image)
+    gyro.forget_before(image - PERIOD)
+    assert gyro.turn(image - PERIOD, image) is not None
+    assert gyro.turn(image - PERIOD - 1, image) is None
 
 
 def test_the_covariance_is_that_of_white_noise_and_of_the_bias() -> None:
@@ -235,6 +273,20 @@ def test_after_30_s_of_pairs_the_bias_is_known_to_a_tenth_of_it(seed: int) -> No
     assert off @ np.linalg.solve(gyro.bias_covariance, off) < 16  # of 3 expected
 
 
+def test_information_of_a_pair_adds_to_that_of_the_bias() -> None:
+    rng, seconds = np.random.default_rng(11), 0.1
+    known, of_pair = some_covariance(rng, 3), some_covariance(rng, 3)
+    bias = 0.01 * rng.normal(size=3)
+    gyro = constant(np.zeros(3), noise=GyroNoise(0.05, 0.0), to_camera=TO_CAMERA)
+    gyro.bias_covariance = known
+    # The camera turned by what the gyro did not measure.
+    gyro.learn(0, PERIOD, rotation_exp(TO_CAMERA @ bias * seconds), of_pair)
+    J, noise = seconds * TO_CAMERA, of_pair + 0.05**2 * seconds * np.eye(3)
+    expected = np.linalg.inv(np.linalg.inv(known) + J.T @ np.linalg.solve(noise, J))
+    assert np.allclose(gyro.bias_covariance, expected)
+    assert np.allclose(gyro.bias, expected @ J.T @ np.linalg.solve(noise, J @ bias), rtol=1e-3)
+
+
 def test_a_standstill_determines_the_bias() -> None:
     gyro, biases = felt_by(np.tile(np.eye(4), (101, 1, 1)), Mems(), 3)
     for i in range(100):
@@ -255,6 +307,27 @@ def test_rest_is_distinguished_from_the_slowest_rotation() -> None:
                for gyro in (at_rest, turning)]
     assert all(at_rest[0])
     assert not any(at_rest[1])
+
+
+@pytest.mark.parametrize('axis', range(3))
+def test_a_camera_that_shakes_to_and_fro_about_any_axis_is_not_at_rest(axis: int) -> None:
+    """It shakes at twenty hertz, so that it is back at each image, by five times the noise."""
+    rng, noise = np.random.default_rng(7), NOISE.density * np.sqrt(200) * np.ones(3)
+    for amplitude, rests in ((0.0, True), (5 * np.sqrt(2) * noise[0], False)):
+        gyro = mounted()
+        gyro.bias_covariance = np.eye(3) * 1e-5**2
+        for i in range(41):
+            shaking = amplitude * np.sin(2 * np.pi * 20 * i / 200) * np.eye(3)[axis]
+            gyro.add(i * 5_000_000, shaking + rng.normal(0, noise))
+        assert gyro.at_rest(0, PERIOD) is gyro.at_rest(PERIOD, 2 * PERIOD) is rests
+
+
+def test_two_samples_do_not_tell_a_camera_at_rest() -> None:
+    """One that shakes may be at the same point of its way at both."""
+    for hertz, rests in ((10, False), (20, True)):
+        gyro = constant(np.zeros(3), hertz=hertz)
+        gyro.bias_covariance = np.eye(3) * 1e-5**2
+        assert gyro.at_rest(0, PERIOD) is rests
 
 
 def test_a_gyro_that_never_agrees_is_not_trusted() -> None:
@@ -300,6 +373,50 @@ def test_fused_errors_are_consistent_with_their_covariance_and_smaller() -> None
     assert np.allclose(found.covariance_6[:, 3:] @ found.t, 0, atol=1e-12)
 
 
+def some_covariance(rng: np.random.Generator, size: int) -> Array:
+    """Return a covariance with standard deviations of 0.01 to 0.03 along any axes."""
+    axes = np.linalg.qr(rng.normal(size=(size, size)))[0]
+    return np.asarray(axes * np.square(rng.uniform(0.01, 0.03, size)) @ axes.T)
+
+
+@pytest.mark.parametrize('t', [
+    unit(np.array(way)) for way in ((-0.3, 0.2, 0.9), (0.1, 0.7, -0.7), (0.6, 0.8, 0.0))])
+def test_information_of_a_rotation_adds_to_that_of_a_pair(t: Array) -> None:
+    rng = np.random.default_rng(8)
+    covariance, of_turn = some_covariance(rng, 5), some_covariance(rng, 3)
+    R, little = rotation_exp(rng.normal(size=3)), 1e-6 * rng.normal(size=3)
+    information = np.linalg.inv(covariance)
+    information[:3, :3] += np.linalg.inv(of_turn)
+    both = np.linalg.inv(information)
+    same = fused(pair(R, t, covariance), MeasuredRotation(R, of_turn))
+    assert np.allclose(same.R, R) and np.allclose(same.t, t)
+    assert np.allclose(same.covariance_5, both, rtol=1e-9)
+    for off in little, -little:
+        found = fused(pair(R, t, covariance), MeasuredRotation(rotation_exp(off) @ R, of_turn))
+        step = both[:, :3] @ np.linalg.solve(of_turn, off)
+        assert np.allclose(rotation_log(found.R @ R.T), step[:3], rtol=1e-4, atol=1e-11)
+        assert np.allclose(found.t - t, sphere_tangents(t) @ step[3:], rtol=1e-4, atol=1e-11)
+        # The basis of its tangents flips where t passes by the image plane.
+        assert np.allclose(found.covariance_6, same.covariance_6, atol=1e-8)
+        assert np.allclose(found.covariance_6, pair(R, found.t, found.covariance_5).covariance_6)
+
+
+def test_without_parallax_only_the_rotation_is_fused() -> None:
+    rng = np.random.default_rng(4)
+    covariance, of_turn = some_covariance(rng, 5), some_covariance(rng, 3)
+    R, off = rotation_exp(rng.normal(size=3)), 1e-6 * rng.normal(size=3)
+    visual = replace(pair(R, unit(rng.normal(size=3)), covariance),
+                     status=Status.NO_PARALLAX, t=np.zeros(3))
+    found = fused(visual, MeasuredRotation(rotation_exp(off) @ R, of_turn))
+    both = np.linalg.inv(np.linalg.inv(covariance[:3, :3]) + np.linalg.inv(of_turn))
+    assert np.allclose(rotation_log(found.R @ R.T), both @ np.linalg.solve(of_turn, off),
+                       rtol=1e-4, atol=1e-11)
+    assert not found.t.any() and found.status is Status.NO_PARALLAX
+    assert np.allclose(found.covariance_6[:3, :3], both)
+    assert np.array_equal(found.covariance_6[3:, 3:], visual.covariance_6[3:, 3:])
+    assert not found.covariance_6[:3, 3:].any() and not found.covariance_6[3:, :3].any()
+
+
 def test_a_rotation_without_information_changes_nothing() -> None:
     visual = pair(rotation_exp(np.array([0.01, 0, 0])), np.array([0, 0, 1.0]), np.eye(5) * 1e-6)
     found = fused(visual, MeasuredRotation(np.eye(3), np.eye(3) * 1e6))
@@ -308,10 +425,34 @@ def test_a_rotation_without_information_changes_nothing() -> None:
 
 
 def test_a_pair_with_another_rotation_does_not_agree() -> None:
-    visual = pair(np.eye(3), np.array([0, 0, 1.0]), np.eye(5) * np.radians(0.01)**2)
-    sure = np.eye(3) * np.radians(0.004)**2
-    assert agrees(MeasuredRotation(rotation_exp(np.radians([0.03, 0, 0])), sure), visual)
-    assert not agrees(MeasuredRotation(rotation_exp(np.radians([0.3, 0, 0])), sure), visual)
+    """Not even rotations that both are sure of are the same to a hundredth of a degree."""
+    visual = pair(np.eye(3), np.array([0, 0, 1.0]), np.eye(5) * np.radians(0.001)**2)
+    for degrees, agree in ((0.03, True), (0.3, False)):
+        other = rotation_exp(np.radians([degrees, 0, 0]))
+        measured = MeasuredRotation(other, np.eye(3) * np.radians(0.001)**2)
+        assert agrees(measured, visual) is measured.compatible_with(visual.R) is agree
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_rotations_differ_if_noise_makes_such_a_difference_less_than_once_in_a_million(
+        seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    covariance, of_turn = some_covariance(rng, 5), some_covariance(rng, 3)
+    visual = pair(rotation_exp(rng.normal(size=3)), unit(rng.normal(size=3)), covariance)
+    off = np.linalg.cholesky(covariance[:3, :3] + of_turn) @ unit(rng.normal(size=3))
+    for chance, agree in ((2e-6, True), (0.5e-6, False)):
+        turn = rotation_exp(np.sqrt(chi2.isf(chance, 3)) * off)
+        assert agrees(MeasuredRotation(turn @ visual.R, of_turn), visual) is agree
+
+
+def test_a_rotation_is_incompatible_with_those_a_thousand_times_less_likely_than_itself() -> None:
+    rng = np.random.default_rng(9)
+    measured = MeasuredRotation(rotation_exp(rng.normal(size=3)), some_covariance(rng, 3))
+    for _ in range(5):
+        sigma = np.linalg.cholesky(measured.covariance) @ unit(rng.normal(size=3))
+        for times, compatible in ((900, True), (1100, False)):
+            R = rotation_exp(-np.sqrt(2 * np.log(times)) * sigma) @ measured.R
+            assert measured.compatible_with(R) is compatible
 
 
 def test_a_rotation_decides_between_two_motions_only_by_its_covariance() -> None:
@@ -348,3 +489,55 @@ def test_a_bias_estimated_from_a_moving_object_is_reset() -> None:
         fitted.append(gyro.trusted)
     assert not all(fitted) and fitted[-1]
     assert np.linalg.norm(gyro.bias - biases[-1]) < 0.1 * np.linalg.norm(biases[-1])
+
+
+# Without images
+
+def test_dead_reckoning_frame_by_frame_is_as_sure_as_the_gyro_over_the_whole_time() -> None:
+    """The errors of its bias and scale factor are the same in all frames, so they add up."""
+    gyro, priors = constant(np.array([0, 0, 0.05]), 3.0, noise=GyroNoise(0, 0)), MotionPriors()
+    priors.gyro, priors.known_ns = gyro, 5 * PERIOD
+    pose, covariance = np.eye(4), np.zeros((6, 6))
+    for i in range(5, 25):
+        reckoned = priors.dead_reckoned((i * PERIOD, (i + 1) * PERIOD))
+        assert reckoned is not None
+        motion, of_motion = reckoned
+        pose, covariance = pose @ motion, compose(pose, covariance, motion, of_motion)
+    whole = gyro.turn(5 * PERIOD, 25 * PERIOD)
+    assert whole is not None
+    assert np.allclose(pose[:3, :3], whole.R.T)
+    assert np.allclose(covariance[3:, 3:], whole.covariance, rtol=1e-2, atol=1e-9)
+    # Nothing measures the translation.
+    assert not pose[:3, 3].any() and np.linalg.eigvalsh(covariance[:3, :3])[0] >= 1e6
+
+
+def test_the_error_of_dead_reckoning_is_along_the_axes_of_the_camera_before() -> None:
+    """By a bias that differs from axis to axis, in a large rotation; 1 % is by its scale."""
+    bias_covariance = some_covariance(np.random.default_rng(12), 3)
+
+    def reckoned(bias: Array) -> tuple[Array, Array]:
+        gyro, priors = constant(np.array([1.5, 0, 1.0]), noise=GyroNoise(0, 0),
+                                to_camera=TO_CAMERA), MotionPriors()
+        gyro.bias, gyro.bias_covariance, priors.gyro = bias, bias_covariance, gyro
+        found = priors.dead_reckoned((0, SECOND))
+        assert found is not None
+        return found[0][:3, :3], found[1][3:, 3:]
+
+    R, covariance = reckoned(np.zeros(3))
+    by_bias = np.column_stack([rotation_log(reckoned(1e-6 * axis)[0] @ R.T) / 1e-6
+                               for axis in np.eye(3)])
+    assert np.allclose(covariance, by_bias @ bias_covariance @ by_bias.T + (
+        0.01 * rotation_angle(R, np.eye(3)))**2 * np.eye(3), rtol=1e-2, atol=4e-6)
+
+
+@pytest.mark.parametrize(('verdicts', 'is_used'), [
+    ([], True), ([False], False), ([True, False], True), ([True, False, False], False),
+    ([True] * 20 + [False] * 19, True), ([True] * 20 + [False] * 21, False)])
+def test_a_gyro_is_dead_reckoned_if_half_of_the_pairs_agreed(
+        verdicts: list[bool], is_used: bool) -> None:
+    priors = MotionPriors()
+    assert priors.dead_reckoned((0, PERIOD)) is None
+    priors.gyro = constant(np.array([0, 0, 0.1]))
+    for agreed in verdicts:
+        priors.gyro.judge(agreed)
+    assert (priors.dead_reckoned((0, PERIOD)) is not None) is is_used
