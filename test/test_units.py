@@ -60,6 +60,18 @@ def test_units_follow_the_scale_ratios_of_loops():
     assert found == pytest.approx(units, abs=0.04)
 
 
+@pytest.mark.parametrize('gap', [
+    {'kind': 'unknown', 'scale_known': False}, {'scale_known': False}, {'motion': np.eye(4)}])
+def test_the_unit_changes_where_no_length_carries_it_on(gap):
+    """Tracking is lost and begins again, or the length of a step is unknown or zero."""
+    edges, _ = drifting(circles(), drift=0.0)
+    edges[44] = replace(edges[44], **gap)
+    jumped = np.where(np.arange(N) > 44, np.log(2), 0.0)
+    edges[N - 1:] = [replace(edge, log_scale_ratio=(
+        jumped[edge.target] - jumped[edge.source], 0.005)) for edge in edges[N - 1:]]
+    assert log_units(N, edges) == pytest.approx(jumped, abs=0.01)
+
+
 def test_outlier_scale_ratio_is_rejected():
     edges, units = drifting(circles(), wrong=(40,))
     assert log_units(N, edges) == pytest.approx(units, abs=0.04)
@@ -75,11 +87,13 @@ def test_without_scale_ratios_nothing_is_rescaled():
 
 def test_rescaled_edge_keeps_rotation_and_relative_uncertainty():
     errors, motion = np.random.default_rng(5).normal(size=(6, 20)), circles()[7]
-    edge = rescaled_edge(Edge(0, 1, motion, errors @ errors.T / 20), 3.0)
+    covariance = errors @ errors.T / 20
+    edge = rescaled_edge(Edge(0, 1, motion, covariance, uncorrelated=covariance[:3, :3]), 3.0)
     assert np.array_equal(edge.motion[:3, :3], motion[:3, :3])
     assert np.array_equal(edge.motion[:3, 3], 3 * motion[:3, 3])
     errors[:3] *= 3
     assert np.allclose(edge.covariance, errors @ errors.T / 20)
+    assert np.allclose(edge.uncorrelated, edge.covariance[:3, :3])
 
 
 def test_loops_correct_scale_drift():
