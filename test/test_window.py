@@ -313,6 +313,34 @@ def test_points_keep_their_places_in_the_world_when_the_camera_rotates() -> None
     assert len(known.rotated(rotation_exp(np.array([0, np.pi, 0]))).rho) == 0
 
 
+@pytest.mark.parametrize('k1', [0.0, -0.015, 0.015])
+def test_depths_of_one_pair_give_the_length_of_the_next_through_any_lens(k1: float) -> None:
+    rng = np.random.default_rng(1)
+    x = rng.uniform((100, 50), (1100, 310), (150, 2))
+    places, pairs = rng.uniform(5, 40, (150, 1)) * rays(K, x), []
+    lengths = 1.7, 0.6
+    for length in lengths:
+        R, t = rotation_exp(rng.normal(size=3) * 0.01), unit(np.array([0.4, 0.1, 0.9]))
+        moved = places @ R.T + length * t
+        x, y = projected(K, places, k1), projected(K, moved, k1)
+        pairs.append(RelativePose(Status.OK, R, t, np.eye(5) * 1e-12, x=x, y=y, y_opt=y.copy(),
+                                  inliers=np.arange(150) < 120))
+        if len(pairs) == 1:
+            between = moved
+            # These move as points behind the camera would.
+            pairs[0].y_opt[:10] = projected(K, places[:10] @ R.T - length * t, k1)
+        places = moved
+    known, chosen = KnownDepths.of_pair(K, k1, pairs[0], lengths[0]), slice(10, 120)
+    assert np.array_equal(known.pixels, pairs[0].y[chosen])
+    assert np.allclose(known.rho, 1 / between[chosen, 2], rtol=1e-3)
+    found = known.lengths(pairs[1])
+    assert len(found.values) == 110 and np.allclose(found.values, lengths[1], rtol=1e-3)
+    turn = rotation_exp(np.array([0.02, -0.3, 0.05]))
+    turned = known.rotated(turn)
+    assert np.allclose(turned.pixels, projected(K, between[chosen] @ turn.T, k1), atol=1e-2)
+    assert np.allclose(turned.rho, 1 / (between[chosen] @ turn.T)[:, 2], rtol=1e-3)
+
+
 def test_landmarks_are_not_made_of_noise() -> None:
     """A pair whose depths are noise creates none; half of them would be in front, and near."""
     street = Street(seed=0, frames=3, noise=0.3)
