@@ -6,7 +6,7 @@ from itertools import pairwise
 import math
 
 from djet_ros.core.geometry import rotation_exp
-from djet_ros.replay.drift import Drift, drift
+from djet_ros.replay.drift import Drift, drift, path_scale
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -102,6 +102,15 @@ def test_rotation_drift_does_not_depend_on_scale() -> None:
     one, other = drift(truth, estimate), drift(truth, shrunk)
     assert one.rotation_deg_per_100m == pytest.approx(other.rotation_deg_per_100m)
     assert other.translation_percent > 80
+
+
+def test_a_path_in_another_unit_and_axes_has_the_scale_of_its_spread() -> None:
+    truth = winding(6, 400)[0][:, :3, 3]
+    elsewhere = truth @ rotation_exp(np.array([0.3, -1.0, 0.5])).T + (5, -3, 80)
+    assert path_scale(0.2 * elsewhere, truth) == pytest.approx(5)
+    assert path_scale(truth, truth[::-1]) == pytest.approx(1)
+    # Lost where the true path is known, and not at the origin.
+    assert path_scale(np.tile(truth[3], (len(truth), 1)), truth) == 1
 
 
 def test_no_drift_below_100_metres() -> None:

@@ -68,9 +68,14 @@ def path_length(places: Array) -> float:
 
 
 def path_scale(places: Array, truth: Array) -> float:
-    """Return the factor that scales a path (N, 3) to the true one (N, 3), by their spread."""
+    """
+    Return the factor that scales a path (N, 3) to the true one (N, 3), by their spread.
+
+    1 if it stands still.
+    """
     spread, true_spread = (np.linalg.norm(path - path.mean(0)) for path in (places, truth))
-    return float(true_spread / spread) if spread > 0 else 1.0
+    # The spread of equal places is the rounding of their mean.
+    return float(true_spread / spread) if np.ptp(places, axis=0).any() else 1.0
 
 
 def scale_change(places: Array, truth: Array) -> float:
