@@ -29,6 +29,7 @@ from djet_ros.recordings.trajectories import read_tum
 from djet_ros.replay.alignment import aligned, position_rmse
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 SIGMAS = np.array([0.01, 0.01, 0.01, 1e-3, 1e-3, 1e-3])
 
@@ -622,6 +623,21 @@ def test_alignment_undoes_any_motion_and_scale():
     holes[3:6] = np.nan
     assert np.allclose(aligned(moved, holes), truth)
     assert position_rmse(truth + np.array([3, 0, 4]), holes) == pytest.approx(5)
+
+
+@pytest.mark.parametrize('flat', [1.0, 1e-3])
+def test_alignment_of_a_noisy_or_mirrored_path_is_the_best_rotation(flat):
+    """Chirality is not undone: a camera that turns left instead of right has an error."""
+    rng = np.random.default_rng(3)
+    truth = rng.normal(size=(20, 3)) * [1.0, flat, 2.0] + [7, 8, 9]
+    noisy = truth @ rotation_exp(rng.normal(size=3)).T + 0.1 * rng.normal(size=truth.shape)
+    for estimate in noisy, noisy * [-1, 1, 1]:
+        path, goal = estimate - estimate.mean(0), truth - truth.mean(0)
+        R, left = Rotation.align_vectors(goal, path)
+        assert position_rmse(aligned(estimate, truth), truth) * np.sqrt(20) == pytest.approx(left)
+        scale = float((goal * R.apply(path)).sum() / (path**2).sum())
+        assert np.allclose(aligned(estimate, truth, metric=False) - truth.mean(0),
+                           scale * R.apply(path))
 
 
 # The command
