@@ -25,6 +25,7 @@ from djet_ros.odometry.scale import (
     ScaleSource,
     SpeedScale,
 )
+from djet_ros.odometry.scale_filter import ScaleFilter
 from djet_ros.odometry.structure import TrackScale
 from djet_ros.odometry.uncertainty import motion_covariance, PathCovariance
 from djet_ros.odometry.visual_odometry import VisualOdometry
@@ -662,3 +663,122 @@ def test_outliers_as_long_as_the_visible_ground_do_not_change_the_scale():
     metres[80:] = 0.8
     logs, *_ = factors(metres, alike=8)
     assert logs[-1] == pytest.approx(np.log(0.8), abs=0.02)
+
+
+def test_single_outliers_do_not_add_up_to_a_change():
+    metres = np.ones(160)
+    metres[5::3] = 1.5
+    logs, *_ = factors(metres, alike=0)
+    assert np.abs(logs).max() < 0.01
+
+
+def metric(share=0.05):
+    """Return the scale of a track after one length, of 3 m a unit: known to 2 %, and a share."""
+    scale = ScaleFilter()
+    scale.configure(share)
+    scale.update(Length(6.0, 6 * share, True), 2.0, 0.0, 0.1)
+    return scale
+
+
+@pytest.mark.parametrize(('sigma', 'of_units', 'noise'), [
+    (0.05, 0.0, 0.02), (np.hypot(0.05, 0.04), 0.0, 0.04), (0.05, 0.03, np.hypot(0.02, 0.03))])
+def test_a_factor_is_as_sure_as_both_lengths_without_what_all_have_in_common(
+        sigma, of_units, noise):
+    """Of lengths with 5 % in common at least 2 % are their own, and average out."""
+    scale = ScaleFilter()
+    scale.configure(0.05)
+    for count in range(1, 6):
+        scale.update(Length(3.0, 3 * sigma, True), 2.0, of_units, 0.1)
+        assert scale.factor == pytest.approx(1.5)
+        assert np.sqrt(scale.variance) == pytest.approx(noise / np.sqrt(count))
+
+
+def test_metric_lengths_have_the_errors_of_factor_and_source_and_relative_ones_only_their_own():
+    scale = ScaleFilter()
+    scale.configure(0.05)
+    scale.add_noise(0.03**2)
+    relative = scale.scaled(2.0, 0.01, False)
+    assert (relative.value, relative.metric) == (2.0, False)
+    assert relative.sigma == relative.own.sigma == pytest.approx(0.01 * 2)
+    # It was never measured, so no source is wrong in it.
+    assert relative.common.variances == pytest.approx([0.03**2, 0.0])
+    length = metric().scaled(2.0, 0.01, True)
+    assert length.value == pytest.approx(6.0) and length.metric
+    assert length.sigma == pytest.approx(6 * np.sqrt(0.01**2 + 0.02**2 + 0.05**2))
+    assert length.own.sigma == pytest.approx(0.01 * 6)
+    assert length.common.variances == pytest.approx([0.02**2, 0.05**2])
+
+
+def test_a_factor_wanders_until_its_lengths_are_no_longer_metres():
+    """That is where it is off by 35 %; the next length then begins anew."""
+    scale = metric()
+    assert scale.scaled(2.0, 0.01, True).metric
+    for count in range(1, 14):
+        scale.add_noise(0.1**2)
+        assert scale.metric is (count < 13)
+    length = scale.scaled(2.0, 0.01, False)
+    assert (length.known, length.metric) == (True, False)
+    assert length.value == pytest.approx(6.0) and length.sigma == pytest.approx(0.01 * 6)
+    assert length.common.variances[1] == 0.05**2
+    scale.update(Length(8.0, 0.4, True), 2.0, 0.0, 0.1)
+    assert scale.metric and scale.factor == pytest.approx(4)
+    # Nothing is left of the error of the factor, but all of that of the source.
+    assert scale.scaled(2.0, 0.01, True).common.kept == pytest.approx([0, 1])
+    assert scale.scaled(2.0, 0.01, True).common.kept == pytest.approx([1, 1])
+
+
+@pytest.mark.parametrize(('share', 'error'), [(0.05, 20 * 0.05), (0.02, np.hypot(0.5, 0.2))])
+def test_lengths_with_another_share_have_another_error_in_common(share, error):
+    """Ten metres with 5 % are followed by ten with as much, the same, or with 2 %."""
+    scale, path, here, ahead = metric(), PathCovariance(), np.eye(4), pose(z=1.0)
+    for number in range(20):
+        if number == 10:
+            scale.configure(share)
+        scale.update(Length(1.0, 0.05, True), 1.0, 0.0, 0.1, exact=True)
+        length = scale.scaled(1.0, 0.0, True)
+        path = path.moved(here, ahead, np.zeros((6, 6)), length.common)
+        here = here @ ahead
+    assert np.sqrt(path.pose[2, 2]) == pytest.approx(error)
+
+
+def test_exact_lengths_leave_nothing_of_the_errors_before():
+    """The steps in between wander by 10 %; a source without errors of its own ends that."""
+    scale, path, here, ahead = metric(0.0), PathCovariance(), np.eye(4), pose(z=1.0)
+    for _ in range(25):
+        scale.update(Length(1.0, 0.0, True), 1.0, 0.0, 0.1, exact=True)
+        assert (scale.factor, scale.variance) == (1.0, 0.0)
+        scale.add_noise(0.1**2)
+        path = path.moved(here, ahead, np.zeros((6, 6)), scale.scaled(1.0, 0.0, True).common)
+        here = here @ ahead
+    assert np.sqrt(path.pose[2, 2]) == pytest.approx(0.1 * np.sqrt(25))
+
+
+def crept(scale, steps, units, hertz=30):
+    """Show steps of a millimetre, each as long as its standard deviation, in units of a track."""
+    for _ in range(steps):
+        scale.update(Length(1e-3, 1e-3, True), units, 0.0, 1 / hertz)
+
+
+def test_lengths_that_may_be_noise_are_summed_for_a_second_and_no_longer():
+    """The sum of more than sixteen is significant, by four standard deviations."""
+    for hertz, significant in ((10, False), (30, True)):
+        scale = ScaleFilter()
+        crept(scale, 3 * hertz, 0.5, hertz)
+        assert scale.metric is significant
+    assert scale.factor == pytest.approx(2e-3)
+
+
+@pytest.mark.parametrize('change', ['share', 'unit'])
+def test_lengths_before_and_after_a_change_are_not_summed(cards, change):
+    frame, track = cards.frame(0.0), TrackScale()
+    track.configure(ESTIMATOR, RelativeScale(), 0.0)
+    scale = track._filter
+    crept(scale, 12, 0.5)
+    if change == 'share':
+        track.configure(ESTIMATOR, RelativeScale(), 0.02)
+    else:
+        track.begin(TwoViewEstimator(ESTIMATOR).view(frame.gray, frame.K))
+    crept(scale, 12, 1.0)
+    assert not scale.metric
+    crept(scale, 8, 1.0)
+    assert scale.metric and scale.factor == pytest.approx(1e-3)
