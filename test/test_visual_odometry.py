@@ -25,7 +25,7 @@ from djet_ros.odometry.scale import (
     SpeedScale,
     UnitScale,
 )
-from djet_ros.odometry.uncertainty import compose, motion_covariance
+from djet_ros.odometry.uncertainty import compose, motion_covariance, standstill_covariance
 from djet_ros.odometry.visual_odometry import VisualOdometry
 from djet_ros.recordings.kitti import KittiSequence
 import numpy as np
@@ -463,6 +463,44 @@ def test_the_covariance_of_a_motion_is_that_of_sampled_motions():
                                  relative.t + delta[3:])
         errors.append(error(camera_motion(disturbed, 2.0 + longer), exact))
     assert_covariance(errors, motion_covariance(relative, length))
+
+
+def test_a_motion_without_a_direction_is_as_unsure_as_it_is_long_along_each_axis():
+    rng = np.random.default_rng(3)
+    relative = replace(some_relative(rng), status=Status.NO_PARALLAX, t=np.zeros(3))
+    rotation = relative.R.T @ relative.covariance_6[:3, :3] @ relative.R
+    for length, sigma in ((Length(2.0, 0.1, True), 2.0), (Length(0.0, 0.1, True), 1e-3),
+                          (Length(2.0, 0.1, False), 1e3)):
+        covariance = motion_covariance(relative, length)
+        assert covariance[:3, :3] == pytest.approx(np.eye(3) * sigma**2)
+        assert not covariance[:3, 3:].any() and not covariance[3:, :3].any()
+        assert np.allclose(covariance[3:, 3:], rotation, rtol=1e-12)
+
+
+def test_a_measured_length_of_zero_does_not_make_the_direction_exact():
+    relative = some_relative(np.random.default_rng(4))
+    along = np.pad(relative.R.T @ relative.t, (0, 3))
+    of_length = 0.01**2 * np.outer(along, along)
+    assert np.allclose(motion_covariance(relative, Length(0.0, 0.01, True)) - of_length,
+                       motion_covariance(relative, Length(1e-3, 0.0, True)), rtol=1e-6)
+
+
+def test_a_standstill_is_known_to_a_tenth_of_a_usual_step_and_turns_by_a_pixel_at_most():
+    relative = some_relative(np.random.default_rng(5))
+    for length, sigma in ((Length(2.0, 0.1, True), 0.2), (Length(0.0, 0.1, True), 1e-3),
+                          (Length(2.0, 0.1, False), 1e3)):
+        for pair, rotation in ((relative, relative.covariance_6[:3, :3]),
+                               (RelativePose(Status.DEGENERATE), np.eye(3) * 1e-3**2)):
+            covariance = standstill_covariance(pair, length)
+            assert covariance[:3, :3] == pytest.approx(np.eye(3) * sigma**2)
+            assert covariance[3:, 3:] == pytest.approx(rotation)
+            assert not covariance[:3, 3:].any() and not covariance[3:, :3].any()
+
+
+def test_a_pair_without_a_covariance_says_nothing_of_its_motion():
+    covariance = motion_covariance(RelativePose(Status.DEGENERATE), Length(2.0, 0.1, True))
+    assert np.sqrt(np.diag(covariance)) == pytest.approx([1e3] * 3 + [np.pi] * 3)
+    assert np.array_equal(covariance, np.diag(np.diag(covariance)))
 
 
 def disturbed(exact, delta):
