@@ -235,6 +235,45 @@ def test_a_pure_rotation_is_zero_translation(floor):
     assert np.sqrt(seen.covariance[0, 0]) < 0.05
 
 
+def test_an_unknown_motion_is_zero_only_if_the_ground_is_at_the_same_place(floor):
+    """A lorry fills the rest of the image, say, and the camera moves ten centimetres."""
+    unknown = RelativePose(Status.TOO_FEW_MATCHES)
+    ground, before = Ground(K, SIZE[::-1], 0.0), view(floor.gray(seed=1))
+    still, moves = (ground.motion(before, view(floor.gray(z=z, seed=2)), unknown)
+                    for z in (0.0, 0.1))
+    assert still.value[0] == 0.0 and moves is None
+
+
+@pytest.mark.parametrize('metres', [0.2, 0.8])
+@pytest.mark.parametrize('tile', [15, 25, 40])
+def test_a_floor_of_equal_tiles_gives_no_estimate(tile, metres):
+    """It looks the same after any number of tiles, of 30 to 80 cm."""
+    floor = Floor()
+    floor._texture = np.tile(floor._texture[:tile], (1024 // tile + 1, 1))[:1024]
+    views = [view(floor.gray(z=z, seed=i)) for i, z in enumerate((0.0, metres))]
+    assert Ground(K, SIZE[::-1], 0.0).motion(
+        *views, moved(floor_pose(0.0), floor_pose(0.0, z=metres))) is None
+
+
+def test_what_is_beside_the_lane_or_far_ahead_is_not_taken_for_ground(floor):
+    """Beyond one and a half heights to either side, or six ahead, anything else may move."""
+    ground, motion = Ground(K, SIZE[::-1], 0.0), moved(floor_pose(0.0), floor_pose(0.0, z=0.8))
+    v, u = np.mgrid[:SIZE[1], :SIZE[0]] - np.array([79.5, 199.5])[:, None, None]
+    lane = (v > 300.0 / 6) & (np.abs(u) < 1.5 * v)
+    # Contrast is measured around each pixel, by means of means over 25 of them.
+    lane = cv2.dilate(lane.astype(np.uint8), np.ones((65, 65))).astype(bool)
+    assert lane.mean() < 0.7
+    found = []
+    for others in (0, 5, 6):
+        before, after = floor.gray(seed=1), floor.gray(z=0.8, seed=2)
+        if others:
+            before[~lane] = after[~lane] = Floor(others).gray()[~lane]
+        found.append(ground.motion(view(before), view(after), motion))
+    for one in found[1:]:
+        assert np.array_equal(one.value, found[0].value)
+        assert np.array_equal(one.covariance, found[0].covariance)
+
+
 # From pair to pair
 
 def see_pair(scale, floor, i, z, dz, status=Status.OK, gray=None):
