@@ -3,7 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-from cards import Cards, DEPTHS, pose
+from cards import Cards, DEPTHS, K as CARDS_K, pose
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.covariance import lift
 from djet_ros.core.estimator import TwoViewEstimator
@@ -375,6 +375,38 @@ def test_a_pair_with_other_depths_than_the_landmarks_disagrees(cards):
     assert scale.agrees(aside, pair.x, wrong) is False
     few = np.arange(4)
     assert scale.agrees(aside, pair.x[few], wrong[few]) is None
+
+
+def test_the_depths_of_landmarks_decide_on_the_status_of_a_pair(cards):
+    true_lengths = [pose(x=0.32)] * 8
+    pair = Drive(cards).go(true_lengths)[-1].relative
+    turned, drive = Drive(cards), Drive(cards)
+    for one in turned, drive:
+        one.go(true_lengths[:-1])
+    verified, aside = drive.odometry._scale.verified, Pose(np.eye(3), np.array([-1.0, 0, 0]))
+    assert pair.status is Status.OK and verified(pair, CARDS_K) is pair
+    # Other depths than before: it may be the motion of something else.
+    nearer = np.random.default_rng(6).uniform(0.2, 3, len(pair.x))[:, None]
+    wrong = replace(pair, y_opt=pair.x + nearer * (pair.y_opt - pair.x))
+    doubted = verified(wrong, CARDS_K)
+    assert doubted.status is Status.AMBIGUOUS and not np.isfinite(doubted.covariance_6).any()
+    # Of several motions the only one that gives the known depths is the true one.
+    other = Pose(np.eye(3), np.array([0, 0, -1.0]))
+    for one, rivals, status in (
+            (pair, (other,), Status.OK), (pair, (other, aside), Status.AMBIGUOUS),
+            (pair, (), Status.OK), (wrong, (other,), Status.AMBIGUOUS)):
+        assert verified(replace(one, status=Status.AMBIGUOUS, rivals=rivals), CARDS_K
+                        ).status is status
+    # A rotation, for which the direction of noise was taken.
+    turn = pose(yaw=0.02)
+    rotated = turned.go([turn])[-1].relative
+    found = verified(replace(rotated, status=Status.OK, t=aside.t), CARDS_K)
+    assert found.status is Status.NO_PARALLAX and not found.t.any()
+    assert np.allclose(found.R, turn[:3, :3].T, atol=1e-3)
+    # Landmarks do not tell bodies apart, nor what there are too few matches for.
+    for status in Status.TWO_MOTIONS, Status.TOO_FEW_MATCHES, Status.NO_PARALLAX:
+        undecided = replace(pair, status=status)
+        assert verified(undecided, CARDS_K) is undecided
 
 
 def test_landmarks_observed_between_keyframes_contradict_other_depths_too(cards):
