@@ -37,17 +37,14 @@ class RipMap:
         for length in image.shape:
             if length & (length - 1):
                 raise ValueError(f'texture side is {length}; it must be a power of two')
-        rows = _halvings(image.astype(np.float32), axis=0)
         self._sizes = tuple(_level_sizes(length) for length in image.shape)
         self._starts = tuple(_level_starts(sizes) for sizes in self._sizes)
-        heights, widths = self._sizes
-        self._atlas = np.empty((int(heights.sum()) + 2 * len(heights),
-                                int(widths.sum()) + 2 * len(widths)), np.uint8)
-        for top, row in zip(self._starts[0], rows):
-            for left, level in zip(self._starts[1], _halvings(row, axis=1)):
-                tile = np.pad(np.clip(np.rint(level), 0, 255).astype(np.uint8), 1, mode='wrap')
-                self._atlas[int(top) - 1:int(top) - 1 + tile.shape[0],
-                            int(left) - 1:int(left) - 1 + tile.shape[1]] = tile
+        # one below the other, so that all are halved along their rows at once
+        rows = np.concatenate([np.pad(level, ((1, 1), (0, 0)), mode='wrap')
+                               for level in _halvings(image.astype(np.float32), axis=0)])
+        self._atlas = np.concatenate([
+            np.pad(np.clip(np.rint(level), 0, 255).astype(np.uint8), ((0, 0), (1, 1)), mode='wrap')
+            for level in _halvings(rows, axis=1)], axis=1)
 
     @property
     def shape(self) -> tuple[int, int]:
