@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 import csv
 from dataclasses import replace
 import json
@@ -490,16 +491,22 @@ def test_ctrl_c_in_a_terminal_ends_all_processes_at_once_in_one_line(verb, momen
                                 '--workers', '2'], stdout=subprocess.DEVNULL,
                                stderr=subprocess.PIPE, text=True, start_new_session=True)
     enough = 0.0 if moment == 'while a worker starts' else 2.5
-    wait_for(lambda: any(cpu_seconds(one) >= enough for one in workers_of(process))
-             or process.poll() is not None)
-    assert process.poll() is None
-    workers, begin = workers_of(process), monotonic()
-    # As a terminal does: to all of them.
-    os.killpg(process.pid, signal.SIGINT)
-    _, printed = process.communicate(timeout=60)
-    assert monotonic() - begin < 3
-    assert (process.returncode, printed) == (130, 'djet: interrupted\n')
-    wait_for(lambda: not any(Path(f'/proc/{worker}').exists() for worker in workers))
+    try:
+        wait_for(lambda: any(cpu_seconds(one) >= enough for one in workers_of(process))
+                 or process.poll() is not None)
+        assert process.poll() is None
+        workers, begin = workers_of(process), monotonic()
+        # As a terminal does: to all of them.
+        os.killpg(process.pid, signal.SIGINT)
+        _, printed = process.communicate(timeout=60)
+        assert monotonic() - begin < 3
+        assert (process.returncode, printed) == (130, 'djet: interrupted\n')
+        wait_for(lambda: not any(Path(f'/proc/{worker}').exists() for worker in workers))
+    finally:
+        # Where one of these fails, the others would work for a minute beside the next tests.
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
 
 
 def test_results_of_other_settings_are_not_mixed(road, tmp_path):
