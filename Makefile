@@ -26,7 +26,8 @@ PYTHON ?= $(shell for python in python3.12 python3.11 python3.13 python3; do \
 # modules of the package anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test lint lowest fuzz audit results recorded pages installed installed-lowest clean
+.PHONY: demo test lint lowest fuzz audit results recorded pages installed installed-lowest \
+	lowest-libraries clean
 
 demo: $(VENV)/.installed
 	$(VENV)/bin/djet demo $(if $(SEQUENCE),'$(SEQUENCE)') --output demo --overwrite
@@ -47,6 +48,7 @@ lowest: $(LOWEST)/.installed-test
 # the environments alone, for .ci/run
 installed: $(TOOLS)
 installed-lowest: $(LOWEST)/.installed-test
+lowest-libraries: $(LOWEST)/.libraries
 
 # everything that reads what strangers made, for FUZZ_SECONDS each
 fuzz: $(VENV)/.installed-fuzz
@@ -88,8 +90,14 @@ $(AUDIT)/.installed: setup.py | $(AUDIT)/bin/pip
 	$(AUDIT)/bin/pip install --quiet --editable '.[audit,cluster,dds,peers,slam]'
 	touch $@
 
-$(LOWEST)/.installed-test: $(BUILT) test/lowest.txt | $(LOWEST)/bin/pip
-	$(LOWEST)/bin/pip install --quiet --editable '.[test]' --constraint test/lowest.txt
+# Only the tests use this environment, and compile the few modules that they import.
+$(LOWEST)/.libraries: test/lowest.txt | $(LOWEST)/bin/pip
+	$(LOWEST)/bin/pip install --quiet --no-compile --requirement test/lowest.txt
+	touch $@
+
+$(LOWEST)/.installed-test: $(BUILT) $(LOWEST)/.libraries
+	$(LOWEST)/bin/pip install --quiet --no-compile --editable '.[test]' \
+		--constraint test/lowest.txt
 	touch $@
 
 %/bin/pip:
