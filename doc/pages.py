@@ -209,13 +209,13 @@ def compared(results: Any) -> str:
 
 
 def comparison(part: Any) -> str:
-    """Return the table of one sequence by method."""
+    """Return the table of one sequence by method; D-JET, preset best, is the first."""
     seeds = len(part['seeds'])
     head = f'{pairs(part)} pairs' + (f' of {seeds} seeds' if seeds > 1 else '')
     worst = ('worst seed',) if seeds > 1 else ()
     header = ('method', 'preset', 'estimated', 'rotation: mean', 'median', '95 %', *worst,
-              'direction: mean', 'median', '95 %', *worst, 'failed', 'of these `OK`', 'ms')
-    rows = []
+              'direction: mean', 'median', '95 %', *worst, 'failed', 'of these `OK`', 'time')
+    rows, unit = [], part['methods'][0]['ms']
     for one in part['methods']:
         figures = []
         for what, digits in DIGITS.items():
@@ -224,7 +224,7 @@ def comparison(part: Any) -> str:
             figures += [number(value, digits) for value in values]
         rows.append((TITLES[one['method']], one['preset'] if one['method'] in OURS else '–',
                      estimated(one), *figures, str(one['failed']), str(one['sure']),
-                     f'{one["ms"]:.0f}'))
+                     f'{one["ms"] / unit:.2f}'))
     return f'{head}.\n\n{table(header, rows)}'
 
 
