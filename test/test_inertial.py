@@ -425,6 +425,13 @@ def test_a_rotation_without_information_changes_nothing() -> None:
 
 
 def test_a_pair_with_another_rotation_does_not_agree() -> None:
+    visual = pair(np.eye(3), np.array([0, 0, 1.0]), np.eye(5) * np.radians(0.01)**2)
+    sure = np.eye(3) * np.radians(0.004)**2
+    assert agrees(MeasuredRotation(rotation_exp(np.radians([0.03, 0, 0])), sure), visual)
+    assert not agrees(MeasuredRotation(rotation_exp(np.radians([0.3, 0, 0])), sure), visual)
+
+
+def test_rotations_agree_to_a_few_hundredths_of_a_degree_however_sure_both_are() -> None:
     """Not even rotations that both are sure of are the same to a hundredth of a degree."""
     visual = pair(np.eye(3), np.array([0, 0, 1.0]), np.eye(5) * np.radians(0.001)**2)
     for degrees, agree in ((0.03, True), (0.3, False)):

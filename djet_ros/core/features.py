@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import cv2
 from djet_ros import compiled
+from djet_ros.core.geometry import norms
 from djet_ros.core.masks import Mask
 from djet_ros.core.parallel import map_parallel, run_both
 from djet_ros.core.types import Array, Features
@@ -82,7 +83,7 @@ def match_nearby(previous: Features, current: Features,
     claim, best_previous, best_current = most_similar(
         strips, (previous.descriptors[rows], (x - centre) * weight),
         (current.descriptors[columns], (y - centre) * weight))
-    distances = np.linalg.norm(y[claim] - x, axis=1)
+    distances = norms(y[claim] - x)
     mutual = (claim >= 0) & (best_previous == best_current[claim]) & (distances <= search_radius)
     best = np.flatnonzero(mutual)[np.argsort(-best_previous[mutual], kind='stable')]
     return _one_to_one(np.stack([rows[best], columns[claim[best]]], axis=1))

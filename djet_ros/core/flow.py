@@ -8,6 +8,7 @@ displacement exceeds the reach of its windows, or if the lighting changes.
 from __future__ import annotations
 
 import cv2
+from djet_ros.core.geometry import norms
 from djet_ros.core.hamming import match_distances
 from djet_ros.core.types import Array, View
 import numpy as np
@@ -64,8 +65,7 @@ def track_features(previous: View, current: View, start: Array, reach: float,
 def _within(reach: float, places: NDArray[np.float32], references: NDArray[np.float32]
             ) -> NDArray[np.bool_]:
     """Return the (N,) bool mask of the places (N, 1, 2) that are nearer than a reach to others."""
-    x, y = (places - references)[:, 0].T
-    return np.asarray(np.sqrt(x * x + y * y) < reach)
+    return np.asarray(norms((places - references)[:, 0]) < reach)
 
 
 def _flow(before: NDArray[np.uint8], after: NDArray[np.uint8], points: NDArray[np.float32],

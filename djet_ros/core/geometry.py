@@ -9,6 +9,7 @@ Tracking").
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import cv2
 from djet_ros import compiled
@@ -34,7 +35,7 @@ def rotation_exp(omega: Array) -> Array:
     if omega.ndim == 1:  # Rodrigues' formula
         return np.asarray(cv2.Rodrigues(omega)[0])
     # For a zero rotation the quotients are 1 to the last bit.
-    half = np.maximum(np.sqrt((omega * omega).sum(1)) / 2, 1e-9)[:, None, None]
+    half = np.maximum(norms(omega) / 2, 1e-9)[:, None, None]
     turning, quotient = skew(omega), np.sin(half) / half
     # sin(a) / a and (1 - cos(a)) / a^2
     return np.asarray(np.eye(3) + quotient * np.cos(half) * turning
@@ -59,7 +60,7 @@ def unit(v: Array) -> Array:
     return np.asarray(v / np.where(length > 0, length, 1.0))
 
 
-def norms(v: Array) -> Array:
+def norms(v: NDArray[Any]) -> NDArray[Any]:
     """Lengths (…) of short vectors along the last axis, by component: a third of the time."""
     return np.asarray(np.sqrt(sum(component**2 for component in np.moveaxis(v, -1, 0))))
 

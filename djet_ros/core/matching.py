@@ -151,7 +151,7 @@ def _resolved(previous: View, current: View, y: Array, bits: Array, pairs: NDArr
     distance = match_distances(previous.smoothed, previous.features.points[tracked],
                                current.smoothed, matched)
     lost = np.isinf(bits[tracked])
-    elsewhere = ~lost & (np.linalg.norm(y[tracked] - matched, axis=1) > _SAME_PLACE)
+    elsewhere = ~lost & (norms(y[tracked] - matched) > _SAME_PLACE)
     more_similar = lost | (elsewhere & (distance < bits[tracked] - _CLEAR_BITS))
     unclear = elsewhere & ~more_similar & ~(distance > bits[tracked] + _CLEAR_BITS)
     y[tracked[more_similar]] = matched[more_similar]

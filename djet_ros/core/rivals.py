@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 from djet_ros.core.cells import sum_by_cell
-from djet_ros.core.geometry import chirality_signs, inverse_depths, rays, unit
+from djet_ros.core.geometry import chirality_signs, inverse_depths, norms, rays, unit
 from djet_ros.core.jet import clipped_scale, JetProblem, Loss, robust_scale
 from djet_ros.core.sketch import losses_in_front, refine_all, Sketch
 from djet_ros.core.starts import starts_around, subsampled
@@ -153,7 +153,7 @@ def _fits_homography(H: Array, x: Array, y: Array, noise: float) -> bool:
     """Return whether a homography (3, 3) brings x to y, both (N, 2), to within their noise."""
     if not np.isfinite(H).all():
         return False
-    errors = np.linalg.norm(cv2.perspectiveTransform(x[:, None], H)[:, 0] - y, axis=1)
+    errors = norms(cv2.perspectiveTransform(x[:, None], H)[:, 0] - y)
     # For normal errors in both directions the median distance is 1.18 standard deviations.
     return bool(np.median(errors) < _MAX_EXCESS * 1.18 * noise
                 and (errors > _OUTLIER * noise).mean() < _MAX_OFF_PLANE)

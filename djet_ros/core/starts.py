@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import cv2
 from djet_ros.core.fusion import MeasuredRotation
-from djet_ros.core.geometry import in_front, nearest_rotation, rays, unit
+from djet_ros.core.geometry import in_front, nearest_rotation, norms, rays, unit
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray
@@ -112,7 +112,7 @@ def translation_directions(K: Array, x: Array, y: Array, R: Array) -> list[Array
     focal = float(K[0, 0])
     normals = np.cross(rays(K, x) @ R.T, rays(K, y)) * focal
     # A match with hardly any parallax does not constrain t.
-    normals = normals[np.linalg.norm(normals, axis=1) > _MIN_PARALLAX]
+    normals = normals[norms(normals) > _MIN_PARALLAX]
     directions: list[Array] = []
     while len(directions) < _DIRECTIONS and len(normals) > 2:
         one, other = np.random.default_rng(0).integers(0, len(normals), (2, _PAIRS))

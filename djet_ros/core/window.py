@@ -375,7 +375,7 @@ class Window:
             rotated, moved = (self._projected(places) for places in (
                 points_in_frame(self._K, self._poses, visible, last) @ R.T,
                 points_in_frame(self._K, self._poses, visible, newest)))
-            due = median(np.linalg.norm(moved - rotated, axis=1)) > self._tuning.parallax
+            due = median(norms(moved - rotated)) > self._tuning.parallax
         self._is_keyframe[-1] = due
 
     def _append(self, view: View, relative: RelativePose, length: float) -> None:
