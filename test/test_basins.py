@@ -2,17 +2,25 @@
 
 from itertools import combinations
 
-from djet_ros.core.basins import choose_basin
+from djet_ros.core.basins import better_by_parts, choose_basin
 from djet_ros.core.covariance import CHI2_999, pose_difference
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.geometry import rays
-from djet_ros.core.jet import epipolar_residuals, JetProblem
+from djet_ros.core.geometry import rays, rotation_exp, unit
+from djet_ros.core.jet import epipolar_residuals, JetProblem, Loss, minimise
+from djet_ros.core.rivals import pose_distance
 from djet_ros.core.starts import hemisphere_starts
+from djet_ros.core.types import Pose
 import numpy as np
 import pytest
-from two_view import K, SIDEWAYS, two_views
+from two_view import FORWARD, K, project, SIDEWAYS, two_views
 
 NOISE = 0.5
+
+
+def problem_of(x: np.ndarray, y: np.ndarray) -> JetProblem:
+    """Return the problem of matches (N, 2) that are as accurate in all directions."""
+    spread = np.repeat([[1.0], [0.0], [1.0]], len(y), axis=1) / K[0, 0]**2
+    return JetProblem(rays(K, x).T.copy(), rays(K, y).T.copy(), spread, np.zeros(len(y)))
 
 
 @pytest.mark.parametrize('seed', range(16))
@@ -21,8 +29,7 @@ def test_basins_of_a_pair_differ_significantly_for_its_matches(seed):
     rng = np.random.default_rng(seed)
     views = two_views(rng, 100, SIDEWAYS, near=30.0)
     y = views.y + rng.normal(0, NOISE, views.y.shape)
-    spread = np.repeat([[1.0], [0.0], [1.0]], len(y), axis=1) / K[0, 0]**2
-    problem = JetProblem(rays(K, views.x).T.copy(), rays(K, y).T.copy(), spread, np.zeros(len(y)))
+    problem = problem_of(views.x, y)
     basin = choose_basin(problem, views.x, hemisphere_starts(views.R, 12), EstimatorConfig(), None,
                          None)
     for one, other in combinations([basin.pose, *basin.rivals], 2):
@@ -31,3 +38,25 @@ def test_basins_of_a_pair_differ_significantly_for_its_matches(seed):
         off = pose_difference(one.R, one.t, other)
         # The noise of the best matches.
         assert off @ (near @ near.T) @ off / NOISE**2 > CHI2_999 / 2
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_a_part_of_the_image_shows_that_a_pose_is_a_compromise_of_two_motions(seed):
+    """As behind a wide lorry, whose epipolar lines are nearly those of the world."""
+    rng = np.random.default_rng(seed)
+    views = two_views(rng, 600, FORWARD)
+    lorry = (views.x[:, 0] > 300) & (views.x[:, 0] < 700)
+    ahead = project(K, views.points @ rotation_exp(np.array([0.01, 0.034, -0.005])).T
+                    + unit(np.array([0.25, 0.0, -1.0])))[0]
+    world, mixed = (problem_of(views.x, y + rng.normal(0, NOISE / 5, y.shape))
+                    for y in (views.y, np.where(lorry[:, None], ahead, views.y)))
+    true = Pose(views.R, views.t)
+    compromise = minimise(mixed, views.R, views.t, Loss('cauchy', 2.0)).pose
+    assert pose_distance(compromise, true) > 0.03
+    found = better_by_parts(mixed, views.x, compromise, 'geman_mcclure')
+    assert found is not None
+    assert pose_distance(found, true) < 0.002
+    # One motion alone: the pose of all matches is the best.
+    of_all = minimise(world, views.R, views.t, Loss('geman_mcclure', NOISE)).pose
+    found = better_by_parts(world, views.x, of_all, 'geman_mcclure')
+    assert found is None or pose_distance(found, of_all) < 0.002

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from djet_ros.core.covariance import CHI2_999, pose_differences
@@ -91,6 +91,10 @@ class BasinTuning:
     steps_nearby: int = 6
     # squared Mahalanobis distance below which two minima are the same
     same_minimum: float = CHI2_999
+    # chosen: columns and rows of parts of the image, with equally many matches each
+    parts: tuple[int, int] = (4, 2)
+    # chosen: steps from the motion of a part
+    steps_of_part: int = 10
     # preference of the first basin over all others for a decision before they have converged: an
     # error of one in three million, if errors in different cells are independent
     clear_preference: float = 5.0
@@ -267,6 +271,37 @@ def lowest_nearby_minimum(problem: JetProblem, places: Array, solution: Solution
     preferred = preferences(losses, places, best)
     return minima[best], tuple(Rival(pose, float(preference)) for index, (pose, preference)
                                in enumerate(zip(poses, preferred)) if index != best)
+
+
+def better_by_parts(problem: JetProblem, places: Array, pose: Pose, loss: str) -> Pose | None:
+    """
+    Return a pose that matches clearly prefer to a given one, found by a part of the image alone.
+
+    If a body moves nearly as the camera does, one pose may fit both loosely, and starts from all
+    matches lead to it. But a body covers one region: in most parts of the image, matches follow
+    one motion only. places: (N, 2) pixels of the matches; loss: name of the robust loss.
+    """
+    found = [pose, *(_motion_of(problem.subset(part), pose, loss) for part in _parts(places))]
+    scale = max(refine_all(problem, found, Loss(), 0).scales().min(), MIN_SCALE)
+    tight = Loss(loss, BASIN_TUNING.tight * scale)
+    refined = refine_all(problem, found, tight, BASIN_TUNING.steps_to_compare)
+    best = refined.pose(int(costs_in_front(problem, refined, tight).argmin()))
+    preferred = preferences(losses_at(problem, [pose, best], tight), places, 1)[0]
+    return best if preferred >= SIGNIFICANT_PREFERENCE else None
+
+
+def _parts(places: Array) -> Iterator[NDArray[np.int64]]:
+    """Return the indices of places (N, 2) in each part of the image."""
+    columns, rows = BASIN_TUNING.parts
+    for column in np.array_split(places[:, 0].argsort(kind='stable'), columns):
+        yield from np.array_split(column[places[column, 1].argsort(kind='stable')], rows)
+
+
+def _motion_of(part: JetProblem, pose: Pose, loss: str) -> Pose:
+    """Return the motion of some matches alone, from that of all."""
+    start = basin_of(part, pose)
+    robust = Loss(loss, BASIN_TUNING.tight * start.scale)
+    return minimise(part, pose.R, pose.t, robust, BASIN_TUNING.steps_of_part, start.residuals).pose
 
 
 def _distinct(poses: Sequence[Pose], solution: Solution, information: Array, bound: float

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from djet_ros.core.algorithm import Algorithm, ALGORITHM_TUNING, Track
-from djet_ros.core.basins import BASIN_TUNING, likeliest
+from djet_ros.core.basins import BASIN_TUNING, better_by_parts, likeliest
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import MeasuredRotation
 from djet_ros.core.geometry import norms
@@ -80,23 +80,17 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
 
 def _best_basin(algorithm: Algorithm, track: Track, predicted: Pose | None) -> Track:
     """
-    Return the best basin after each has converged, if the matches do not decide between them.
+    Return the best basin after each has converged, if there may be a better one.
 
-    After round one keypoints and patch warps follow one pose, which favours it: a wrong pose keeps
-    matches that suit it, at three times the noise of the right one. Matches that do not vote cost
-    as much as outliers. If they still do not decide, the basin nearest to the previous motion is
-    taken. Re-projection errors do not depend on the pose that places them, and are compared
-    already.
+    Matches that do not vote cost as much as outliers. If they still do not decide, the basin
+    nearest to the previous motion is taken.
     """
-    pair, config, first = algorithm.pair, algorithm.config, algorithm.first
-    if config.method == 'rpe' or all(rival.preference >= SIGNIFICANT_PREFERENCE
-                                     for rival in track.rivals):
-        return track
-    starts = sorted([first.solution.pose, *first.rivals],
-                    key=lambda pose: unsigned_distance(track.pose, pose))
-    # The nearest one led to the track.
-    reruns = (algorithm.rerun(start, predicted) for start in starts[1:])
+    pair, config = algorithm.pair, algorithm.config
+    reruns = (algorithm.rerun(start, predicted) for start in [
+        *_undecided_basins(algorithm, track), *_basins_of_parts(algorithm, track)])
     tracks = [track, *(rerun for rerun in reruns if rerun is not None)]
+    if len(tracks) == 1:
+        return track
     loss = Loss('geman_mcclure', config.loss_scale * min(each.scale for each in tracks))
     losses = np.full((len(tracks), len(pair.y)), loss.scale**2)
     for row, each in zip(losses, tracks):
@@ -107,6 +101,37 @@ def _best_basin(algorithm: Algorithm, track: Track, predicted: Pose | None) -> T
               for pose, preference in zip(poses, preferences(losses, pair.x, best))
               if unsigned_distance(poses[best], pose) > BASIN_TUNING.same_basin)
     return replace(tracks[best], rivals=tuple(rivals))
+
+
+def _undecided_basins(algorithm: Algorithm, track: Track) -> list[Pose]:
+    """
+    Return the other basins of round one, if the matches do not decide between them.
+
+    After round one keypoints and patch warps follow one pose, which favours it: a wrong pose keeps
+    matches that suit it, at three times the noise of the right one. Re-projection errors do not
+    depend on the pose that places them, and are compared already.
+    """
+    first = algorithm.first
+    if algorithm.config.method == 'rpe' or all(
+            rival.preference >= SIGNIFICANT_PREFERENCE for rival in track.rivals):
+        return []
+    # The nearest one led to the track.
+    return sorted([first.solution.pose, *first.rivals],
+                  key=lambda pose: unsigned_distance(track.pose, pose))[1:]
+
+
+def _basins_of_parts(algorithm: Algorithm, track: Track) -> list[Pose]:
+    """
+    Return the better basin that a part of the image leads to, if there is one.
+
+    Only without a previous motion: where a body has most of the matches, that tells which motion
+    is the camera's.
+    """
+    pair, loss = algorithm.pair, algorithm.config.loss
+    if pair.prior is not None or loss == 'none':
+        return []
+    better = better_by_parts(track.problem, pair.x[track.voting], track.pose, loss)
+    return [] if better is None else [better]
 
 
 def _limited_by_chirality(algorithm: Algorithm, track: Track) -> Track:
