@@ -149,6 +149,7 @@ def test_failed_frame_is_bridged_without_a_vertex(tmp_path):
         (i, i + 1, 'odometry') for i in range(FRAMES - 2)]
 
 
+@pytest.mark.slow
 def test_repeated_stamps_after_a_reset_get_their_own_motions(tmp_path):
     """As those of a simulation that is reset: what was first is not what came second."""
     # Less of a step back would be taken for late images.

@@ -482,6 +482,7 @@ def test_written_configuration_combines_flags_and_file(bag, tmp_path):
     assert np.allclose(lengths[moved], np.linalg.norm(STEP[:3, 3]), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_debug_images_are_those_of_the_node_and_go_when_results_are_replaced(folder, tmp_path):
     results, drawn = tmp_path / 'results', tmp_path / 'results' / 'debug'
     djet('replay', folder, '--output', results, '--debug-images')
@@ -1010,6 +1011,7 @@ def test_ground_truth_of_another_time_gives_a_warning(first, apart, why, tmp_pat
     assert summary(tmp_path / 'r')['drift'] is None
 
 
+@pytest.mark.slow
 def test_several_ground_truths_are_named_with_a_remedy(bag, tmp_path):
     with Bag(bag) as whole:
         messages = [(one.topic, one.message, one.stamp_ns) for one in whole.messages()]

@@ -147,6 +147,7 @@ def test_every_gives_the_poses_of_the_tracker_bit_for_bit(live, drive):
     assert not one.tracker.counts.dropped
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('policy', ['latest', 'every'])
 def test_an_image_stamped_ahead_is_dropped_once_the_next_one_has_come(live, drive, policy):
     one = live(**{'ros.queue_policy': policy})

@@ -125,6 +125,7 @@ def meddle(one, number):
         one.reset()
 
 
+@pytest.mark.slow
 def test_images_prepared_ahead_give_the_same_results(drive, threads):
     def results(ahead):
         """Return all messages of images, of which so many are prepared ahead."""
@@ -186,6 +187,7 @@ def test_unseen_pixels_are_ignored_prepared_ahead_or_not(drive, threads):
     np.testing.assert_array_equal(expected.y_opt, alone.y_opt)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('threads', [1], indirect=True)
 def test_images_prepared_ahead_that_never_come_are_forgotten(drive, threads):
     one = tracker()
@@ -346,6 +348,7 @@ def test_looping_bag_resets_the_odometry(drive):
         assert len(before['path'].poses) == len(after['path'].poses)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('late', [0.05, 0.1, 0.45])
 def test_a_late_image_is_dropped_and_counted_and_changes_no_pose(drive, late):
     one, undisturbed = tracker(), tracker()
@@ -364,6 +367,7 @@ def in_a_row(one, stamped):
         one.image(message, following)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('ahead', [1.5, 5.0, 1e6])
 def test_an_image_stamped_ahead_is_dropped_and_the_trajectory_continues(drive, ahead):
     one, undisturbed = tracker(), tracker()
@@ -464,6 +468,7 @@ def test_constant_stamps_are_reported_as_an_error(drive, stamp):
     assert problems_of(one)[2] == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('prepared', [False, True])
 def test_few_gray_levels_of_12_bits_are_reported_and_corrected_by_the_range(drive, prepared):
     def sent(one, first):
@@ -514,6 +519,7 @@ def speed(seconds, metres_per_second=3.0):
             angular=vector(x=0.0, y=0.0, z=0.0)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('off', 'seen'), [
     (None, 'no speed was received; publish it on speed or speed_odometry, stamped by the clock'),
     (100.0, r'the newest speed is stamped 100\.\d s after the newest image'),
@@ -550,6 +556,7 @@ def test_many_images_dropped_under_load_are_a_warning_and_few_are_none(drive):
     assert '43% of the newest 21 images' in found['images dropped under load']
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('apart', 'dropped'), [
     (0.0, {'equal_stamp': 12}), (0.05, {}), (-0.12, {'late': 12})])
 def test_two_cameras_on_one_topic_are_a_warning_whatever_their_stamps_are(drive, apart, dropped):
