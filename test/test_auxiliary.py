@@ -113,7 +113,6 @@ def test_without_a_gyro_its_messages_change_nothing(drive: Drive) -> None:
     assert heard[0] == heard[1]
 
 
-@pytest.mark.slow
 def test_the_imu_offset_corrects_the_clock_of_a_gyro(drive: Drive) -> None:
     ahead = drive.imu()
     for message in ahead:
@@ -191,7 +190,6 @@ def test_problems_of_a_gyro_are_reported_and_block_nothing(
     assert one.diagnosis().level == 'WARN'
 
 
-@pytest.mark.slow
 def test_a_gyro_with_a_wrong_mounting_is_reported_and_not_used() -> None:
     long = Drive(frames=45)
     one = tracker(**{**IMU, 'odometry.imu_rotation': '0 0 0 1'})
@@ -366,7 +364,6 @@ def test_a_single_pixel_blocks_the_patches_around_it() -> None:
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (17, 43, 27, 53)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('kind', ['file', 'topic'])
 def test_masked_pixels_have_no_influence(drive: Drive, kind: str) -> None:
     """

@@ -53,10 +53,10 @@ def test_a_part_of_the_image_shows_that_a_pose_is_a_compromise_of_two_motions(se
     true = Pose(views.R, views.t)
     compromise = minimise(mixed, views.R, views.t, Loss('cauchy', 2.0)).pose
     assert pose_distance(compromise, true) > 0.03
-    found = better_by_parts(mixed, views.x, compromise, 'geman_mcclure')
+    found = better_by_parts(mixed, views.x, compromise, EstimatorConfig())
     assert found is not None
     assert pose_distance(found, true) < 0.002
     # One motion alone: the pose of all matches is the best.
     of_all = minimise(world, views.R, views.t, Loss('geman_mcclure', NOISE)).pose
-    found = better_by_parts(world, views.x, of_all, 'geman_mcclure')
+    found = better_by_parts(world, views.x, of_all, EstimatorConfig())
     assert found is None or pose_distance(found, of_all) < 0.002

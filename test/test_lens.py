@@ -294,7 +294,6 @@ def test_raw_images_give_a_calibration_file_for_the_driver(
     assert row_of(printed) == f'D: {D[0]:.4g} 0 0 0 0'
 
 
-@pytest.mark.slow
 def test_rectified_images_give_no_calibration_file(
         raw_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # As if rectified with an unknown calibration.
@@ -323,7 +322,6 @@ def test_a_file_for_a_driver_differs_in_the_distortion_alone() -> None:
         assert written[name] == {'rows': 3, 'cols': columns, 'data': values.tolist()}
 
 
-@pytest.mark.slow
 def test_only_part_of_a_long_recording_is_held_in_memory(
         whip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lens, 'MOST_PAIRS', 14)
@@ -332,7 +330,6 @@ def test_only_part_of_a_long_recording_is_held_in_memory(
     assert 10 <= len(report.fit.linearised) <= 14 < report.pairs
 
 
-@pytest.mark.slow
 def test_a_correct_calibration_is_kept_with_fast_rotation_and_blur(
         whip: Path, tmp_path: Path) -> None:
     # 15 degrees from frame to frame, and streaks of nine pixels.
@@ -345,7 +342,6 @@ def test_a_correct_calibration_is_kept_with_fast_rotation_and_blur(
     assert not report.worth_correcting
 
 
-@pytest.mark.slow
 def test_without_rotation_there_is_no_estimate(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     road = render_sequence('road', tmp_path, 5, size=(480, 144))
@@ -362,7 +358,6 @@ def test_a_short_recording_is_reported_as_too_short(whip: Path) -> None:
         lens.examine(recording, Config(), lambda: None)
 
 
-@pytest.mark.slow
 def test_objects_that_move_with_the_camera_can_be_masked(whip: Path, tmp_path: Path) -> None:
     bonnet = np.full((360, 480), 255, np.uint8)
     bonnet[240:] = 0

@@ -227,7 +227,6 @@ def test_the_prior_decides_between_two_motions() -> None:
     assert estimate(x, y, Pose(guess.R, guess.t)).status is Status.OK
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('seed', range(4))
 def test_no_planar_pair_is_certain_of_the_wrong_twin(seed: int) -> None:
     rng, estimator, sure = np.random.default_rng(seed), TwoViewEstimator(), 0
@@ -243,7 +242,6 @@ def test_no_planar_pair_is_certain_of_the_wrong_twin(seed: int) -> None:
     assert sure >= 2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('seed', range(4))
 def test_motion_towards_a_wall_is_not_certain_of_the_wrong_twin(seed: int) -> None:
     """Both are in one basin, and the prior may lead all starts to the same one."""

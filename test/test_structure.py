@@ -97,7 +97,6 @@ def test_a_speed_of_zero_is_ignored_while_images_show_motion(cards):
     assert lengths(driving)[0] == pytest.approx(LENGTHS[4], rel=0.1)
 
 
-@pytest.mark.slow
 def test_a_shaking_rotation_away_from_landmarks_keeps_the_scale(cards):
     drive = Drive(cards)
     before = drive.go(steps(LENGTHS[:4]))
@@ -215,7 +214,6 @@ def test_a_rotation_beyond_all_landmarks_leaves_the_scale_to_one_guess():
     assert odometry._scale._filter.variance < 0.36 + 0.25 + 0.02
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('way', [0.004, 0.008, 0.012])
 def test_motion_too_slow_for_parallax_from_frame_to_frame_accumulates(cards, way):
     drive, slow = Drive(cards), [pose(x=way, yaw=0.001 * (-1)**i) for i in range(30)]
@@ -228,7 +226,6 @@ def test_motion_too_slow_for_parallax_from_frame_to_frame_accumulates(cards, way
     assert np.linalg.norm(gone - [30 * way, 0, 0]) < 4 * sigma
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('way', [0.004, 0.008, 0.012])
 def test_motion_too_slow_for_parallax_accumulates_before_there_are_landmarks(cards, way):
     speed = SpeedScale()
@@ -350,7 +347,6 @@ def test_the_window_keeps_few_views(cards):
     assert (window.landmarks()[:, 2] > 0).mean() > 0.9
 
 
-@pytest.mark.slow
 def test_landmarks_leave_the_window_once_each_at_their_true_position(cards):
     drive, depths = Drive(cards), []
     for number in range(36):
@@ -524,7 +520,6 @@ def test_fast_rotations_keep_the_scale(seed: int) -> None:
     assert np.abs(np.log(ratios / ratios[0])).max() < np.log(1.1)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('frames_per_second', [10, 30])
 @pytest.mark.parametrize('size', [0.1, 0.025])
 def test_a_slow_camera_is_metric_at_any_frame_rate(cards, size, frames_per_second):

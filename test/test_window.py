@@ -212,7 +212,6 @@ def test_the_rotation_drifts_less_than_half_of_that_by_pairs(seed: int) -> None:
     assert by_window < 0.5 * by_pairs
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('seed', range(2))
 def test_steps_are_as_long_as_their_lengths_however_long_the_track(seed: int) -> None:
     window, off, sigmas = NumbersWindow(Street(seed, 160, 0.2, turned=1e-3)), [], []
@@ -267,7 +266,6 @@ def test_a_window_continues_when_images_are_corrected(k1: float) -> None:
     assert np.mean(lengths[-15:]) == pytest.approx(np.mean(lengths[:15]), rel=0.02)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize('curve', [0.0, 0.02])
 @pytest.mark.parametrize('seed', range(3))
 def test_without_distortion_k1_stays_zero(seed: int, curve: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from djet_ros.core.covariance import CHI2_999, pose_differences
 from djet_ros.core.estimator_config import EstimatorConfig
@@ -128,14 +128,13 @@ def choose_basin(problem: JetProblem, places: Array, starts: list[Pose],
     do not; measured: a measured rotation, with which the pose has to be consistent.
     """
     subset = problem.subset(subsampled(len(problem.blur), BASIN_TUNING.matches_to_sketch))
-    scale = max(refine_all(subset, starts, Loss(), 0).scales().min(), MIN_SCALE)
-    tight = Loss(config.loss, min(config.loss_scale, BASIN_TUNING.tight) * scale)
+    scale = _noise(refine_all(subset, starts, Loss(), 0))
+    tight = _tight_loss(config, scale)
     if measured is not None:
         # The majority of the matches gives the noise, and what fits the measured rotation fits it
         # well.
-        scale = max(refine_all(subset, starts, tight, BASIN_TUNING.steps_to_sketch).scales().min(),
-                    MIN_SCALE)
-        tight = replace(tight, scale=min(config.loss_scale, BASIN_TUNING.tight) * scale)
+        scale = _noise(refine_all(subset, starts, tight, BASIN_TUNING.steps_to_sketch))
+        tight = _tight_loss(config, scale)
         sketch = refine_all(subset, starts, tight, BASIN_TUNING.steps_to_compare,
                             _rotation_prior(measured, scale))
         starts = _cheapest_basins(subset, sketch, tight, BASIN_TUNING.rotation_starts)
@@ -180,8 +179,7 @@ def choose_predicted_basin(problem: JetProblem, places: Array, predicted: Pose,
     basins = starts = starts_around(predicted, BASIN_TUNING.directions)
     for steps in (0, *BASIN_TUNING.steps_predicted):
         refined = refine_all(subset, basins, tight, steps)
-        scale = max(refined.scales().min(), MIN_SCALE)
-        tight = Loss(config.loss, min(config.loss_scale, BASIN_TUNING.tight) * scale)
+        tight = _tight_loss(config, _noise(refined))
         if steps:
             basins = _cheapest_basins(subset, refined, tight, BASIN_TUNING.refined_starts)
     if ((len(basins) > 1 and _is_clear(problem, places, basins, tight))
@@ -194,6 +192,16 @@ def choose_predicted_basin(problem: JetProblem, places: Array, predicted: Pose,
         return basin_of(problem, basins[0])
     prior = predicted if predicted.t.any() else None
     return _refine_and_choose(problem, places, basins, tight, prior)
+
+
+def _noise(sketch: Sketch) -> float:
+    """Return the robust standard deviation of the residuals at the pose that fits best."""
+    return max(float(sketch.scales().min()), MIN_SCALE)
+
+
+def _tight_loss(config: EstimatorConfig, noise: float) -> Loss:
+    """Return the loss that tells basins apart, for residuals of some noise."""
+    return Loss(config.loss, min(config.loss_scale, BASIN_TUNING.tight) * noise)
 
 
 def _is_clear(problem: JetProblem, places: Array, basins: list[Pose], loss: Loss) -> bool:
@@ -273,17 +281,17 @@ def lowest_nearby_minimum(problem: JetProblem, places: Array, solution: Solution
                                in enumerate(zip(poses, preferred)) if index != best)
 
 
-def better_by_parts(problem: JetProblem, places: Array, pose: Pose, loss: str) -> Pose | None:
+def better_by_parts(problem: JetProblem, places: Array, pose: Pose, config: EstimatorConfig
+                    ) -> Pose | None:
     """
     Return a pose that matches clearly prefer to a given one, found by a part of the image alone.
 
     If a body moves nearly as the camera does, one pose may fit both loosely, and starts from all
     matches lead to it. But a body covers one region: in most parts of the image, matches follow
-    one motion only. places: (N, 2) pixels of the matches; loss: name of the robust loss.
+    one motion only. places: (N, 2) pixels of the matches.
     """
-    found = [pose, *(_motion_of(problem.subset(part), pose, loss) for part in _parts(places))]
-    scale = max(refine_all(problem, found, Loss(), 0).scales().min(), MIN_SCALE)
-    tight = Loss(loss, BASIN_TUNING.tight * scale)
+    found = [pose, *(_motion_of(problem.subset(part), pose, config) for part in _parts(places))]
+    tight = _tight_loss(config, _noise(refine_all(problem, found, Loss(), 0)))
     refined = refine_all(problem, found, tight, BASIN_TUNING.steps_to_compare)
     best = refined.pose(int(costs_in_front(problem, refined, tight).argmin()))
     preferred = preferences(losses_at(problem, [pose, best], tight), places, 1)[0]
@@ -297,11 +305,11 @@ def _parts(places: Array) -> Iterator[NDArray[np.int64]]:
         yield from np.array_split(column[places[column, 1].argsort(kind='stable')], rows)
 
 
-def _motion_of(part: JetProblem, pose: Pose, loss: str) -> Pose:
+def _motion_of(part: JetProblem, pose: Pose, config: EstimatorConfig) -> Pose:
     """Return the motion of some matches alone, from that of all."""
     start = basin_of(part, pose)
-    robust = Loss(loss, BASIN_TUNING.tight * start.scale)
-    return minimise(part, pose.R, pose.t, robust, BASIN_TUNING.steps_of_part, start.residuals).pose
+    return minimise(part, pose.R, pose.t, _tight_loss(config, start.scale),
+                    BASIN_TUNING.steps_of_part, start.residuals).pose
 
 
 def _distinct(poses: Sequence[Pose], solution: Solution, information: Array, bound: float

@@ -127,10 +127,10 @@ def _basins_of_parts(algorithm: Algorithm, track: Track) -> list[Pose]:
     Only without a previous motion: where a body has most of the matches, that tells which motion
     is the camera's.
     """
-    pair, loss = algorithm.pair, algorithm.config.loss
-    if pair.prior is not None or loss == 'none':
+    pair, config = algorithm.pair, algorithm.config
+    if pair.prior is not None or config.loss == 'none':
         return []
-    better = better_by_parts(track.problem, pair.x[track.voting], track.pose, loss)
+    better = better_by_parts(track.problem, pair.x[track.voting], track.pose, config)
     return [] if better is None else [better]
 
 
