@@ -66,7 +66,8 @@ def test_vectorised_functions_agree_with_single_calls():
 
 @given(arrays(float, (5, 2, 2), elements=st.floats(-3, 3)))
 def test_a_matrix_times_its_inverse_is_one(A):
-    A = A[np.abs(np.linalg.det(A)) > 1e-3]
+    # np.linalg.det divides by a zero pivot
+    A = A[np.abs(A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0]) > 1e-3]
     assert np.allclose(inverses(A) @ A, np.eye(2), atol=1e-9)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from djet_ros.config.safe_files import read_yaml
 from djet_ros.core.types import Array
@@ -91,20 +91,35 @@ def _of_yaml(path: Path, size: tuple[int, int]) -> Intrinsics:
 
 def asl_camera(path: Path) -> tuple[Intrinsics, Array]:
     """Return the camera of a sensor.yaml, and its pose (4, 4) in the body."""
-    sensor = read_yaml(path)
-    if not isinstance(sensor, dict):
-        raise DjetError(f'{path} is no ASL camera description: it has neither intrinsics nor '
-                        'T_BS; replace the file, which may be truncated')
+    sensor, camera_in_body = _asl_sensor(path)
     try:
         named = sensor.get('distortion_model', 'radial-tangential')
         intrinsics = [float(value) for value in sensor['intrinsics']]
         distortion = [float(value) for value in sensor.get('distortion_coefficients', [])]
-        camera_in_body = _rigid(sensor['T_BS']['data'])
     except _UNFIT as error:
         raise DjetError(f'{path} is no ASL camera description (intrinsics, T_BS): '
                         f'{one_line(error)}') from error
-    check_rigid(camera_in_body[None], path)
     return _with_model(path, named, intrinsics, distortion), camera_in_body
+
+
+def asl_mounting(path: Path) -> Array:
+    """Return the pose (4, 4) of a sensor in the body, from its sensor.yaml."""
+    return _asl_sensor(path)[1]
+
+
+def _asl_sensor(path: Path) -> tuple[dict[str, Any], Array]:
+    """Return a sensor.yaml, and the pose (4, 4) of the sensor in the body."""
+    sensor = read_yaml(path)
+    if not isinstance(sensor, dict):
+        raise DjetError(f'{path} is no ASL sensor description: it has no T_BS; replace the file, '
+                        'which may be truncated')
+    try:
+        sensor_in_body = _rigid(sensor['T_BS']['data'])
+    except _UNFIT as error:
+        raise DjetError(f'{path} is no ASL sensor description (T_BS): '
+                        f'{one_line(error)}') from error
+    check_rigid(sensor_in_body[None], path)
+    return sensor, sensor_in_body
 
 
 def kalibr_camera(path: Path) -> tuple[Intrinsics, Array]:
@@ -122,18 +137,6 @@ def kalibr_camera(path: Path) -> tuple[Intrinsics, Array]:
     check_rigid(body_in_camera[None], path)
     camera_in_body = np.asarray(np.linalg.inv(body_in_camera))
     return _with_model(path, named, intrinsics, distortion), camera_in_body
-
-
-def asl_mounting(path: Path) -> Array:
-    """Return the pose (4, 4) of a sensor in the body, from its sensor.yaml."""
-    sensor = read_yaml(path)
-    try:
-        pose = _rigid(sensor['T_BS']['data'])
-    except _UNFIT as error:
-        raise DjetError(f'{path} is no ASL sensor description (T_BS): '
-                        f'{one_line(error)}') from error
-    check_rigid(pose[None], path)
-    return pose
 
 
 def _rigid(values: object) -> Array:
