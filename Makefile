@@ -14,8 +14,10 @@ SEEDS ?= 0,1,2,3,4
 TOOLS := $(VENV)/.installed-lint,peers,test
 # what an installation is made of, beside what it finds in place
 BUILT := setup.py $(wildcard djet_ros/compiled/*.[ch])
+# one more than there are cores: tests that wait for processes would leave theirs idle
+WORKERS ?= $(shell expr $$(nproc 2>/dev/null || getconf _NPROCESSORS_ONLN) + 1)
 # in the order of their names: files of few tests, some of them long, would come last
-PYTEST := python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+PYTEST := python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 # the first that is there, works (a pyenv shim may not) and is new enough
 PYTHON ?= $(shell for python in python3.12 python3.11 python3.13 python3; do \
@@ -82,15 +84,15 @@ $(VENV)/.installed: $(BUILT) | $(VENV)/bin/pip
 	$(VENV)/bin/pip install --quiet --editable .
 	touch $@
 
+# What the tests import is compiled as they do: a fifth of what is installed.
 $(VENV)/.installed-%: $(BUILT) | $(VENV)/bin/pip
-	$(VENV)/bin/pip install --quiet --editable '.[$*]'
+	$(VENV)/bin/pip install --quiet --no-compile --editable '.[$*]'
 	touch $@
 
 $(AUDIT)/.installed: setup.py | $(AUDIT)/bin/pip
 	$(AUDIT)/bin/pip install --quiet --editable '.[audit,cluster,dds,peers,slam]'
 	touch $@
 
-# Only the tests use this environment, and compile the few modules that they import.
 $(LOWEST)/.libraries: test/lowest.txt | $(LOWEST)/bin/pip
 	$(LOWEST)/bin/pip install --quiet --no-compile --requirement test/lowest.txt
 	touch $@
