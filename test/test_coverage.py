@@ -10,8 +10,9 @@ from subprocess import CompletedProcess
 from types import ModuleType
 
 import commands
+from djet_ros.core.covariance import pose_difference, widened_to_span
 from djet_ros.core.geometry import rotation_exp, sphere_tangents, unit
-from djet_ros.core.types import RelativePose, Status
+from djet_ros.core.types import Pose, RelativePose, Status
 from djet_ros.lab.coverage import (
     Coverage,
     coverage_rows,
@@ -66,6 +67,18 @@ def off_by(degrees: float, claimed: float = 0.05) -> float:
 @pytest.mark.parametrize('degrees', [0.05, 1.0, 45.0, 90.0, 135.0, 179.9, 180.0])
 def test_the_error_of_a_direction_is_its_angle(degrees: float) -> None:
     assert off_by(degrees) == pytest.approx((degrees / 0.05)**2, rel=1e-6)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_a_rival_that_is_true_is_inside_the_covariance_that_spans_it(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    R, t = rotation_exp(rng.normal(size=3)), unit(rng.normal(size=3))
+    aside = rng.uniform(0.2, 0.5) * unit(np.cross(t, rng.normal(size=3)))
+    true = Pose(rotation_exp(rng.normal(scale=0.01, size=3)) @ R, rotation_exp(aside) @ t)
+    spanning = widened_to_span(1e-10 * np.eye(5), pose_difference(R, t, true), 0.3)
+    square = normalised_square(RelativePose(Status.OK, R, t, spanning),
+                               camera_motion(RelativePose(Status.OK, true.R, true.t), 2.0))
+    assert square == pytest.approx(1 / 0.3, rel=1e-3)
 
 
 def test_a_certain_direction_that_points_backwards_is_outside_its_ellipsoid() -> None:

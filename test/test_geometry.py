@@ -13,6 +13,7 @@ from djet_ros.core.geometry import (
     inverse_depths,
     inverses,
     line_distances,
+    norms,
     patch_warp,
     rays,
     rotation_angle,
@@ -20,6 +21,7 @@ from djet_ros.core.geometry import (
     singular_values,
     skew,
     slant_warp,
+    sphere_log,
     sphere_tangents,
     unit,
 )
@@ -62,6 +64,17 @@ def test_vectorised_functions_agree_with_single_calls():
     v = np.random.default_rng(2).normal(size=(7, 3))
     assert np.allclose(rotation_exp(v), [rotation_exp(one) for one in v], atol=1e-14)
     assert (sphere_tangents(unit(v)) == [sphere_tangents(unit(one)) for one in v]).all()
+
+
+def test_the_logarithm_of_a_direction_is_the_arc_towards_it():
+    rng = np.random.default_rng(0)
+    t, others = unit(rng.normal(size=3)), unit(rng.normal(size=(50, 3)))
+    arcs = sphere_log(t, others)
+    assert np.allclose(norms(arcs), np.arccos(others @ t))
+    axes = np.cross(t, arcs @ sphere_tangents(t).T)
+    assert np.allclose(rotation_exp(axes) @ t, others)
+    assert np.allclose(sphere_log(t, t), 0) and np.isclose(norms(sphere_log(t, -t)), np.pi)
+    assert np.allclose([sphere_log(t, other) for other in others], arcs)
 
 
 @given(arrays(float, (5, 2, 2), elements=st.floats(-3, 3)))

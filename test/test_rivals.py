@@ -400,7 +400,7 @@ def test_an_improbable_distant_rival_does_not_widen_the_covariance(
     # The squared distance times its probability; otherwise only the covariance of the pose.
     probable = norm.cdf(-preference / 2) if spanned else 0.0
     assert claimed == pytest.approx(np.hypot(
-        0.2 * np.sqrt(2), np.degrees(np.sqrt(probable) * np.sin(aside))), rel=0.01)
+        0.2 * np.sqrt(2), np.degrees(np.sqrt(probable) * aside)), rel=0.01)
 
 
 def test_only_a_motion_like_the_previous_one_continues_it() -> None:

@@ -7,7 +7,7 @@ from functools import cached_property
 
 from djet_ros import compiled
 from djet_ros.core.cells import CELL, group_by_cell, in_few_bytes
-from djet_ros.core.geometry import rotation_log, sphere_tangents
+from djet_ros.core.geometry import rotation_log, sphere_log, sphere_tangents
 from djet_ros.core.jet import epipolar_residuals, JetProblem, LEAST_CURVATURE, Loss, Residuals
 from djet_ros.core.sketch import moved_all, refine_all
 from djet_ros.core.types import Array, Pose
@@ -27,8 +27,9 @@ _SMALLEST_SIDE, _SIDE_COUNT = 8, 7
 _SMALL_CELLS = (CELL // _SMALLEST_SIDE).bit_length() - 1
 
 # chosen: decay of the error correlation from one side to the next, as the distance to the power of
-# -1.5. On scenes rendered with seeds 0-4 residuals decorrelate faster from 32 pixels on; but
-# errors common to the whole image do not show in them, as the pose absorbs these.
+# -1.5. On scenes rendered with seeds 0-4 residuals decorrelate faster from 32 pixels on, on KITTI
+# more slowly up to 128; and errors common to the whole image do not show in them, as the pose
+# absorbs these.
 _DECAY = 2**-1.5
 
 # Side index from which on the correlation is estimated in turn: from all pairs, from those that
@@ -251,15 +252,15 @@ def pose_difference(R: Array, t: Array, other: Pose) -> Array:
     """
     Return the difference (5,) of another motion from (R, t), in the parameters of its covariance.
 
-    Matches determine t up to its sign, so the nearer of both signs counts, by its chord.
+    Matches determine t up to its sign, so the nearer of both signs counts, by its arc.
     """
     return np.asarray(pose_differences(R, t, other.R[None], other.t[None])[0])
 
 
 def pose_differences(R: Array, t: Array, other_R: Array, other_t: Array) -> Array:
     """Return the differences (S, 5) of S motions, R (S, 3, 3) and t (S, 3), from one."""
-    towards = np.where(other_t @ t >= 0, 1.0, -1.0)[:, None] * other_t - t
-    return np.concatenate([rotation_log(other_R @ R.T), towards @ sphere_tangents(t)], axis=1)
+    nearer = np.where(other_t @ t >= 0, 1.0, -1.0)[:, None] * other_t
+    return np.concatenate([rotation_log(other_R @ R.T), sphere_log(t, nearer)], axis=1)
 
 
 def squared_distance(covariance: Array, offset: Array) -> float:

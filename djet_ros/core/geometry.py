@@ -62,7 +62,11 @@ def unit(v: Array) -> Array:
 
 def norms(v: NDArray[Any]) -> NDArray[Any]:
     """Lengths (…) of short vectors along the last axis, by component: a third of the time."""
-    return np.asarray(np.sqrt(sum(component**2 for component in np.moveaxis(v, -1, 0))))
+    first, *others = np.moveaxis(v, -1, 0)
+    total = first * first
+    for component in others:
+        total += component * component
+    return np.asarray(np.sqrt(total))
 
 
 def sphere_tangents(t: Array) -> Array:
@@ -81,17 +85,16 @@ def sphere_tangents(t: Array) -> Array:
 
 def sphere_log(t: Array, other: Array) -> Array:
     """
-    Logarithm (2,) at t (3,) of another direction, in the basis of its tangents.
+    Logarithm (..., 2) at t (3,) of other directions (..., 3), in the basis of its tangents.
 
     Its length is the arc in rad. For opposite directions that is pi, and the direction is
     arbitrary.
     """
-    tangents = sphere_tangents(t)
-    across, along = tangents.T @ other, other @ t
-    chord = np.hypot(*across)
-    if not chord:
-        return np.array([np.pi if along < 0 else 0.0, 0.0])
-    return np.asarray(across * (np.arctan2(chord, along) / chord))
+    across, along = other @ sphere_tangents(t), other @ t
+    sines = norms(across)
+    arcs = np.arctan2(sines, along) / np.maximum(sines, 1e-300)
+    opposite = np.where((sines == 0) & (along < 0), np.pi, 0.0)
+    return np.asarray(across * arcs[..., None] + opposite[..., None] * (1.0, 0.0))
 
 
 def inverse_intrinsics(K: Array) -> Array:

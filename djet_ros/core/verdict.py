@@ -61,7 +61,7 @@ _OVERSTATEMENT = 2.0
 _NEGLIGIBLE_PREFERENCE = _OVERSTATEMENT * SIGNIFICANT_PREFERENCE
 
 # rad; limit of the distance of two motions that one covariance can span: the sphere of directions
-# is curved, and up to here chord and arc agree to a twentieth.
+# is curved, and up to here arc and sine agree to a twentieth.
 _MAX_SPANNED = 0.5
 
 
@@ -250,8 +250,8 @@ def _compare_with_rivals(pose: Pose, covariance: Array, track: Track, x: Array,
         covariance = widened(covariance, pose.t, other)
     if sign_open:
         status = status if track.body_ambiguous else Status.AMBIGUOUS
-        # -t is at chord 2, in no particular tangent direction.
-        for offset in np.sqrt(2) * np.eye(5)[3:]:
+        # The arc to -t is pi, in no particular tangent direction.
+        for offset in np.pi / np.sqrt(2) * np.eye(5)[3:]:
             covariance = widened_to_span(covariance, offset, 0.5)
     return status, covariance, possible
 
