@@ -80,13 +80,12 @@ def _depths_after(pair: RelativePose, motion: Pose, K: Array, shared: NDArray[np
     Return inverse depths (N,) of points of a pair in its second view, by one of its motions.
 
     shared: the mask of these points among the inliers. In units of the translation, and with their
-    standard deviations (N,) as `inverse_depths`. The sign of t is the one with more points in
-    front.
+    standard deviations (N,) as `inverse_depths`. The opposite t gives them the opposite sign.
     """
     rays_x, rays_y = (rays(K, places[pair.inliers][shared]) for places in (pair.x, pair.y))
     rho, sigma = inverse_depths(motion.R, motion.t, rays_x, rays_y)
     depths = depths_in_second(motion.R, motion.t, rays_x, rho)
-    return np.sign(np.median(rho)) * rho / depths, sigma / np.abs(depths)
+    return rho / depths, sigma / np.abs(depths)
 
 
 def _disagreement(known: tuple[Array, Array], triangulated: tuple[Array, Array]) -> Array:
