@@ -18,13 +18,19 @@ from two_view import flight_over_a_plane, K, project, SIZE
 NOISE = 0.1
 
 
-def three_views_of_a_plane(seed: int) -> list[tuple[RelativePose, Pose, Pose]]:
-    """Return two pairs that follow one another, each with its true motion, and with its twin."""
+def three_views_of_a_plane(seed: int, far: int = 0) -> list[tuple[RelativePose, Pose, Pose]]:
+    """
+    Return two pairs that follow one another, each with its true motion, and with its twin.
+
+    Each has its matches in an order of its own, and lacks some of the points of the other. far:
+    number of points that are so far behind the plane that they have no parallax.
+    """
     rng = np.random.default_rng(seed)
     x = rng.uniform((20, 20), np.array(SIZE) - 20, (400, 2))
     normal = unit(np.array([0.3, 0.5, 1]) + 0.1 * rng.normal(size=3)) / 10
     rays = np.column_stack([x, np.ones(len(x))]) @ np.linalg.inv(K).T
     points = rays / (rays @ normal)[:, None]
+    points[:far] *= 1e6
     pixels, pairs, noise = x, [], rng.normal(0, NOISE, (3, *x.shape))
     for number in (1, 2):
         R = Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix()
@@ -38,10 +44,11 @@ def three_views_of_a_plane(seed: int) -> list[tuple[RelativePose, Pose, Pose]]:
         motions = [Pose(turn, unit(way.ravel())) for turn, way in zip(turns, ways)]
         twin = max(motions, key=lambda pose: rotation_angle(pose.R, R) + min(
             direction_angle(sign * pose.t, t) for sign in (1, -1)))
+        matched = rng.permutation(len(x))[:-20]
         pair = RelativePose(
-            Status.AMBIGUOUS, R, unit(t), x=pixels + noise[number - 1],
-            y=seen + noise[number], inliers=np.ones(len(x), bool),
-            residuals=rng.normal(0, np.sqrt(2) * NOISE, len(x)))
+            Status.AMBIGUOUS, R, unit(t), x=(pixels + noise[number - 1])[matched],
+            y=(seen + noise[number])[matched], inliers=np.ones(len(matched), bool),
+            residuals=rng.normal(0, np.sqrt(2) * NOISE, len(matched)))
         pairs.append((pair, Pose(R, unit(t)), twin))
         pixels = seen
     return pairs
@@ -64,6 +71,26 @@ def test_the_true_motion_of_a_plane_is_found_whichever_was_taken_first(seed: int
             assert np.array_equal(found.R, later[0].R) and np.array_equal(found.t, later[0].t)
 
 
+def test_matches_that_slip_along_their_epipolar_lines_rarely_hide_the_true_motion():
+    undecided = 0
+    for seed in range(10):
+        (before, *earlier), (current, *later) = three_views_of_a_plane(seed)
+        true = later[0]
+        y, epipole = current.y[::20], (K @ true.t)[:2] / (K @ true.t)[2]
+        y += 12 * unit(y - epipole) * np.random.default_rng(seed).choice([-1, 1], (len(y), 1))
+        found = consistent_motion(of_motions(before, *earlier), of_motions(current, *later), K)
+        undecided += found is None
+        assert found is None or np.array_equal(found.t, true.t)
+    assert undecided <= 1
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_points_too_far_for_parallax_do_not_hide_the_true_motion(seed: int):
+    (before, *earlier), (current, *later) = three_views_of_a_plane(seed, far=280)
+    found = consistent_motion(of_motions(before, *earlier), of_motions(current, *later), K)
+    assert found is not None and np.array_equal(found.t, later[0].t)
+
+
 def test_nothing_is_decided_if_the_matches_of_the_two_pairs_do_not_agree():
     (before, *earlier), (current, *later) = three_views_of_a_plane(3)
     assert consistent_motion(of_motions(before, *earlier), of_motions(current, *later), K)
@@ -72,6 +99,21 @@ def test_nothing_is_decided_if_the_matches_of_the_two_pairs_do_not_agree():
     rolling = of_motions(current, *later)
     rolling.y[:] += shift
     assert consistent_motion(of_motions(before, *earlier), rolling, K) is None
+    # Many false matches do not make it agree any better.
+    rolling.inliers[::2], rolling.residuals[::2] = False, 20
+    assert consistent_motion(of_motions(before, *earlier), rolling, K) is None
+
+
+@pytest.mark.parametrize('rotates', [0, 1])
+def test_a_pair_taken_as_a_rotation_in_place_decides_nothing(rotates: int):
+    """Its rivals remain, but it tells no depths: not even numbers to divide by."""
+    views = three_views_of_a_plane(3)
+    pairs = [of_motions(*motions) for motions in views]
+    assert consistent_motion(*pairs, K)
+    pair, motion, twin = views[rotates]
+    pairs[rotates] = of_motions(pair, Pose(motion.R, np.zeros(3)), motion, twin)
+    with np.errstate(all='raise'):
+        assert consistent_motion(*pairs, K) is None
 
 
 def test_a_wrong_motion_before_decides_nothing():
@@ -120,7 +162,7 @@ def pair_with_a_lorry(rng: np.random.Generator, voting: np.ndarray) -> RelativeP
     y[500:, 0] += SIZE[0] / 2
     fits = (np.arange(800) < 500) ^ (np.arange(800) % 5 == 0)
     return RelativePose(
-        Status.OK, x=y, y=y, inliers=fits & voting, voting=voting,
+        Status.OK, x=np.add(y, (60, 0)), y=y, inliers=fits & voting, voting=voting,
         residuals=np.where(fits, rng.normal(0, NOISE, 800), rng.choice([-2, 2], 800)))
 
 
@@ -155,6 +197,14 @@ def test_places_that_were_left_out_come_back_once_they_fit_closely():
 def test_a_pair_without_inliers_follows_no_body_more_than_another():
     pair = pair_with_a_lorry(np.random.default_rng(0), np.zeros(800, bool))
     assert of_followed_body(pair, pair.y).all()
+
+
+@pytest.mark.parametrize('count', [1, 5])
+def test_a_few_matches_tell_of_a_body_too(count: int):
+    y = np.random.default_rng(0).uniform((0, 0), SIZE, (count, 2))
+    pair = RelativePose(Status.OK, x=y, y=y, inliers=np.ones(count, bool),
+                        voting=np.ones(count, bool), residuals=np.full(count, NOISE))
+    assert of_followed_body(pair, y[:1] + np.arange(20).reshape(10, 2)).all()
 
 
 @pytest.mark.slow
