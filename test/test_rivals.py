@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+import math
 from types import SimpleNamespace
 
 from djet_ros.core.basins import lowest_nearby_minimum
@@ -16,7 +17,14 @@ from djet_ros.core.covariance import (
 )
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.geometry import direction_angle, rotation_angle, rotation_exp, unit
+from djet_ros.core.geometry import (
+    direction_angle,
+    in_front,
+    rays,
+    rotation_angle,
+    rotation_exp,
+    unit,
+)
 from djet_ros.core.jet import jet_problem, Loss, minimise
 from djet_ros.core.pair import Pair
 from djet_ros.core.rivals import (
@@ -24,6 +32,7 @@ from djet_ros.core.rivals import (
     false_alarms,
     is_planar,
     planar_twin,
+    pose_distance,
     preferences,
     Rival,
     unsigned_distance,
@@ -150,6 +159,16 @@ def test_a_small_body_is_not_mistaken_for_the_static_world() -> None:
     assert not result.inliers[400:].any()
 
 
+@pytest.mark.parametrize('false', [0, 25])
+def test_a_few_matches_that_move_alike_all_over_the_image_are_no_body(false: int) -> None:
+    rng = np.random.default_rng(0)
+    seen, *matches, _ = scene_with_body(400, 40, 'across', (0, SIZE[0]), DEEP)
+    x, y = (np.concatenate([places, rng.uniform((0, 0), SIZE, (false, 2))]) for places in matches)
+    result = estimate(x, y)
+    assert result.status is Status.OK
+    assert direction_angle(result.t, seen.t) < 0.01
+
+
 @pytest.mark.parametrize('stuck', [200, 500])
 @pytest.mark.parametrize('seed', range(3))
 def test_matches_attached_to_a_rotating_camera_are_removed(
@@ -168,6 +187,29 @@ def test_matches_attached_to_a_rotating_camera_are_removed(
         assert rotation_angle(result.R, seen.R) < 1e-3
         assert direction_angle(result.t, seen.t) < 0.02
         assert squared_error(result, seen) < chi2.ppf(0.9999, 5)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_the_prior_tells_a_bonnet_from_a_world_of_one_depth(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    seen = two_views(rng, count=400, t=FORWARD, turn=(0.0, 0.012, 0.0), near=8, far=14)
+    bonnet = rng.uniform((0, 250), SIZE, (200, 2))
+    x, y = np.concatenate([seen.x, bonnet]), np.concatenate([seen.y, bonnet])
+    y += rng.normal(0, NOISE, y.shape) * np.where(np.arange(600) < 400, 1.0, 0.2)[:, None]
+    result = estimate(x, y, Pose(seen.R, seen.t))
+    assert result.status is Status.OK
+    assert rotation_angle(result.R, seen.R) < 1e-3
+    assert direction_angle(result.t, seen.t) < 0.02
+
+
+def test_what_stays_in_place_before_a_standing_camera_is_kept_while_a_lorry_passes() -> None:
+    """Only the static world has depths from near to far; without them, it may be what stays."""
+    rng = np.random.default_rng(0)
+    _, x, y, _ = scene_with_body(1, 300, 'against', (300, 1000), FLAT)
+    still = rng.uniform((0, 0), SIZE, (300, 2))
+    x, y = np.concatenate([still, x]), np.concatenate([still, y])
+    y[:300] += rng.normal(0, NOISE, still.shape)
+    assert len(estimate(x, y).x) == len(x)
 
 
 def test_a_static_sky_before_a_camera_without_rotation_is_kept() -> None:
@@ -268,10 +310,39 @@ def test_planar_twins_are_mutual() -> None:
     assert planar_twin(one, K, x, y, NOISE) is None
 
 
-def test_points_off_a_plane_exclude_its_twin() -> None:
+@pytest.mark.parametrize('seed', range(20))
+def test_a_twin_is_less_likely_if_and_only_if_it_has_points_behind_a_camera(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    x = rng.uniform((0, 0), SIZE, (300, 2))
+    true = Pose(rotation_exp(rng.normal(0, 0.02, 3)), unit(rng.normal(size=3)))
+    H = K @ (true.R + np.outer(true.t, (*rng.normal(0, 0.13, 2), 1 / 3))) @ np.linalg.inv(K)
+    y = np.column_stack([x, np.ones(300)]) @ H.T
+    y = y[:, :2] / y[:, 2:]
+    twin = planar_twin(true, K, x, y, NOISE)
+    assert twin is not None
+    ahead = max(in_front(twin.pose.R, sign * twin.pose.t, rays(K, x), rays(K, y)).mean()
+                for sign in (1, -1))
+    assert (twin.preference > 0) == (ahead < 1)
+    assert twin.preference > 2.33 or ahead > 0.95
+
+
+def test_a_match_at_the_epipole_has_no_depth_and_thus_no_twin() -> None:
+    x, y = plane_of_two_motions()
+    x[0] = K[:2, 2]
+    assert planar_twin(Pose(np.eye(3), np.array([0, 0, -1.0])), K, x, y, NOISE) is None
+
+
+def test_a_relief_of_some_standard_deviations_is_no_plane() -> None:
+    x, y = plane_of_two_motions()
+    relief = np.random.default_rng(0).normal(0, 2.5 * NOISE, y.shape)
+    assert not is_planar(x, y + relief, NOISE)
+
+
+@pytest.mark.parametrize('off', [2.0, 20.0])
+def test_points_off_a_plane_exclude_its_twin(off: float) -> None:
     x, y = plane_of_two_motions()
     assert is_planar(x, y, NOISE)
-    y[:30] += 2.0  # one of seven, ten standard deviations
+    y[:30] += off  # one of seven, ten standard deviations or more
     assert not is_planar(x, y, NOISE)
 
 
@@ -334,6 +405,18 @@ def test_few_inliers_among_many_matches_are_not_significant() -> None:
     assert false_alarms(5, 332, 0.02) == np.inf
     assert false_alarms(100, 332, 0.02) < 0
     assert false_alarms(20, 24, 0.02) < 0
+
+
+@pytest.mark.parametrize(('agreeing', 'matches', 'chance'), [
+    (20, 332, 0.02), (6, 8, 0.5), (7, 7, 0.3), (100, 300, 0.1)])
+def test_false_alarms_are_as_many_as_choices_of_matches_that_agree_by_chance(
+        agreeing: int, matches: int, chance: float) -> None:
+    # Of each size, ten solutions for each five of each group of matches.
+    groups = math.comb(matches, agreeing) * math.comb(agreeing, 5)
+    expected = (matches - 5) * 10 * groups * chance**(agreeing - 5)
+    assert false_alarms(agreeing, matches, chance) == pytest.approx(math.log10(expected))
+    # Lines that are wider than the search agree with every match.
+    assert false_alarms(agreeing, matches, 3.0) == false_alarms(agreeing, matches, 1.0)
 
 
 def preference_between(x: np.ndarray, y: np.ndarray, one: Pose, other: Pose) -> float:
@@ -410,6 +493,26 @@ def test_only_a_motion_like_the_previous_one_continues_it() -> None:
     assert continues_motion(prior, alike, unlike)
     assert not continues_motion(prior, unlike, alike)
     assert not continues_motion(prior, alike, Pose(turned.T, prior.t))  # as like as the other
+    somewhat_less = Pose(rotation_exp(np.array([0, 0.03, 0])), prior.t)
+    assert not continues_motion(prior, alike, somewhat_less)
+    assert not continues_motion(prior, unlike, Pose(np.eye(3), -prior.t))  # unlike, as both
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_the_distance_of_motions_is_the_angle_of_rotation_and_direction(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    one = Pose(rotation_exp(rng.normal(size=3)), unit(rng.normal(size=3)))
+    turn, aside = rng.normal(0, 1e-3, (2, 3))
+    aside -= one.t * (one.t @ aside)
+    R, t = rotation_exp(turn) @ one.R, unit(one.t + aside)
+    turned, moved = np.linalg.norm(turn), np.linalg.norm(aside)
+    for other, angle in ((Pose(R, one.t), turned), (Pose(one.R, t), moved),
+                         (Pose(R, t), np.hypot(turned, moved))):
+        opposite = Pose(other.R, -other.t)
+        assert pose_distance(one, other) == pytest.approx(angle, rel=1e-3)
+        assert pose_distance(one, opposite) > 1.9
+        assert unsigned_distance(one, other) == pytest.approx(angle, rel=1e-3)
+        assert unsigned_distance(one, opposite) == pytest.approx(angle, rel=1e-3)
 
 
 def test_hemisphere_directions_leave_no_large_gap() -> None:
