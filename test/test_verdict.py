@@ -1,0 +1,138 @@
+"""What a pair claims: its covariances, residuals and rivals, also after other evidence decided."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from djet_ros.core.covariance import lifted_covariance, pose_difference
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.geometry import direction_angle, epipolar_lines, fundamental, line_distances
+from djet_ros.core.pair import Pair
+from djet_ros.core.types import Pose, RelativePose, Status
+from djet_ros.core.verdict import as_decided, as_pure_rotation, with_left_out
+import numpy as np
+import pytest
+from two_view import BACKWARD, FORWARD, K, SIDEWAYS, SIZE, two_views, TwoViews, uniform_view
+
+NOISE = 0.2
+
+
+def pair_of(x: np.ndarray, y: np.ndarray, start: Pose | None = None) -> Pair:
+    return Pair(uniform_view(), uniform_view(), x, y, start=start)
+
+
+def estimate(pair: Pair, **settings: float) -> RelativePose:
+    return TwoViewEstimator(EstimatorConfig(method='rpe', **settings)).estimate_pair(pair)
+
+
+def noisy_views(seed: int, t: Sequence[float] = SIDEWAYS, **scene: float
+                ) -> tuple[TwoViews, np.ndarray]:
+    """Return views, and their pixels in the second one with noise."""
+    rng = np.random.default_rng(seed)
+    seen = two_views(rng, t=t, **scene)
+    return seen, seen.y + rng.normal(0, NOISE, seen.y.shape)
+
+
+def open_sign() -> tuple[np.ndarray, np.ndarray]:
+    """Return matches half of which are behind the cameras, and some that fit no motion."""
+    rng = np.random.default_rng(4)
+    parts = [two_views(rng, t=sign * np.array(FORWARD), count=100) for sign in (1, -1)]
+    anywhere = rng.uniform((0, 0), SIZE, (2, 150, 2))
+    return (np.concatenate([*(part.x for part in parts), anywhere[0]]),
+            np.concatenate([*(part.y for part in parts), anywhere[1]]))
+
+
+@pytest.mark.parametrize('t', [SIDEWAYS, FORWARD, BACKWARD])
+def test_a_pose_and_its_covariances_do_not_depend_on_the_sign_that_the_search_started_with(
+        t: Sequence[float]) -> None:
+    seen, y = noisy_views(1, t)
+    one, other = (estimate(pair_of(seen.x, y, Pose(seen.R, sign * seen.t))) for sign in (1, -1))
+    assert direction_angle(one.t, seen.t) < 0.02
+    np.testing.assert_allclose(other.t, one.t, atol=1e-6)
+    size = np.sqrt(np.diag(one.covariance_6))
+    assert np.abs(one.covariance_6[:3, 3:] / np.outer(size[:3], size[3:])).max() > 0.3
+    np.testing.assert_array_less(np.abs(other.covariance_6 - one.covariance_6),
+                                 0.02 * np.outer(size, size))
+
+
+def test_covariances_of_six_are_those_of_five_whatever_the_status() -> None:
+    seen, y = noisy_views(2)
+    known, unsure = estimate(pair_of(seen.x, y)), estimate(pair_of(*open_sign()))
+    assert (known.status, unsure.status) == (Status.OK, Status.AMBIGUOUS)
+    # As a pure rotation it has no t, but the tangents of its covariance remain.
+    for pair, t in ((known, known.t), (unsure, unsure.t), (as_decided(unsure), unsure.t),
+                    (as_pure_rotation(known, K), known.t)):
+        np.testing.assert_allclose(pair.covariance_6, lifted_covariance(pair.covariance_5, t))
+
+
+def test_a_pure_rotation_may_be_as_wrong_as_the_motion_it_replaces() -> None:
+    seen, y = noisy_views(3)
+    motion = estimate(pair_of(seen.x, y))
+    turn = as_pure_rotation(motion, K)
+    off = pose_difference(turn.R, motion.t, Pose(motion.R, motion.t))
+    assert off @ (turn.covariance_5 - motion.covariance_5) @ off == pytest.approx((off @ off)**2)
+
+
+def test_the_opposite_motion_is_a_rival_while_its_sign_is_open() -> None:
+    unsure = estimate(pair_of(*open_sign()))
+    assert any(np.allclose(rival.R, unsure.R) and np.allclose(rival.t, -unsure.t)
+               for rival in unsure.rivals)
+    seen, y = noisy_views(4)
+    assert not estimate(pair_of(seen.x, y)).rivals
+
+
+def test_a_pair_that_other_evidence_decides_is_as_sure_as_without_its_rivals() -> None:
+    unsure = estimate(pair_of(*open_sign()))
+    decided = as_decided(unsure)
+    assert decided.status is Status.OK and not decided.rivals
+    assert np.trace(unsure.covariance_5[3:, 3:]) > 1 > 100 * np.trace(decided.covariance_5)
+
+
+def test_a_wrong_camera_matrix_is_in_the_covariance_without_rivals_too() -> None:
+    x, y = open_sign()
+    exact, wrong = (estimate(pair_of(x, y), calibration_sigma=sigma) for sigma in (0.0, 2.0))
+    for name in ('covariance_5', 'own_covariance_5'):
+        more = np.linalg.eigvalsh(getattr(wrong, name) - getattr(exact, name))
+        assert more[-1] > 1e-8 and more[0] > -1e-6 * more[-1]
+    np.testing.assert_allclose(wrong.own_covariance_5 - exact.own_covariance_5,
+                               wrong.covariance_5 - exact.covariance_5, atol=1e-9)
+
+
+def test_without_parallax_residuals_are_distances_from_lines_and_no_opposite_is_a_rival() -> None:
+    seen, y = noisy_views(5, near=1e5, far=1e6)
+    turn = estimate(pair_of(seen.x, y))
+    assert turn.status is Status.NO_PARALLAX and not turn.rivals
+    # The true place is on the line, so noise across it is all that is left.
+    assert (np.abs(turn.residuals) <= np.linalg.norm(y - seen.y, axis=1) + 0.1).all()
+    assert np.std(turn.residuals) == pytest.approx(NOISE, rel=0.3)
+
+
+def test_matches_that_were_left_out_are_outliers_in_their_places() -> None:
+    seen, y = noisy_views(6, count=300)
+    kept = np.random.default_rng(0).random(300) < 0.6
+    y[~kept] += (0, 5)
+    pair = pair_of(seen.x, y)
+    part = estimate(pair.without(~kept))
+    whole = with_left_out(part, pair, kept)
+    assert (whole.x is pair.x) and (whole.y is pair.y)
+    for name in ('inliers', 'voting', 'y_opt', 'placed', 'placed_covariances', 'residuals',
+                 'hamming', 'losses'):
+        np.testing.assert_array_equal(getattr(whole, name)[kept], getattr(part, name))
+    assert part.inliers.sum() > 100 and not (whole.inliers | whole.voting)[~kept].any()
+    np.testing.assert_array_equal(whole.y_opt[~kept], y[~kept])
+    lines = epipolar_lines(fundamental(K, seen.R, seen.t), seen.x)
+    np.testing.assert_allclose(whole.residuals, line_distances(lines, y), atol=0.5)
+    assert np.median(np.abs(whole.residuals[~kept])) > 3
+
+
+def test_a_rotation_leaves_the_covariance_of_noise_as_it_is() -> None:
+    """Without parallax above the noise the rotation is not biased."""
+    errors = []
+    for seed in range(20):
+        seen, y = noisy_views(seed, near=1e5, far=1e6)
+        turn = estimate(pair_of(seen.x, y))
+        assert turn.status is Status.NO_PARALLAX
+        np.testing.assert_array_equal(turn.covariance_5, turn.own_covariance_5)
+        errors.append(pose_difference(turn.R, seen.t, Pose(seen.R, seen.t)))
+    assert np.linalg.norm(errors, axis=1).max() < 5e-4
