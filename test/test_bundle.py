@@ -15,7 +15,7 @@ from djet_ros.core.bundle import (
     projected,
 )
 from djet_ros.core.geometry import rotation_exp
-from djet_ros.core.radial import undistort
+from djet_ros.core.radial import distort, undistort
 import numpy as np
 import pytest
 
@@ -53,9 +53,21 @@ def test_a_landmark_is_observed_at_its_projection():
             there.ravel())
 
 
+def test_a_camera_takes_points_into_the_world():
+    poses, _ = scene(np.random.default_rng(16))
+    here = np.random.default_rng(17).normal(size=(9, 3))
+    for frame in range(4):
+        camera = poses.camera(frame)
+        world = here @ camera[:3, :3].T + camera[:3, 3]
+        assert world @ poses.R[frame].T + poses.t[frame] == pytest.approx(here)
+
+
 def test_points_far_outside_the_image_are_not_folded_into_it():
-    far = np.array([[20.0, 0, 1], [0, -1e5, 1], [3, 3, -1]])
-    assert (np.abs(projected(K, far, -0.05)) > 2000).any(1).all()
+    far = np.array([[20.0, 0, 1], [0, -1e5, 1], [3, 3, -1], [1e12, 0, 0]])
+    pixels = np.abs(projected(K, far, -0.05))
+    assert (pixels > 2000).any(1).all()
+    # They are rounded to integers.
+    assert pixels.max() < 2**31
 
 
 def test_exact_observations_leave_no_residual():
@@ -63,6 +75,17 @@ def test_exact_observations_leave_no_residual():
     observed = observe(K, poses, landmarks)
     assert np.abs(observed.residuals).max() < 1e-9
     assert np.abs(observed.anchor_residuals).max() < 0.1
+
+
+def test_a_landmark_in_the_plane_of_the_camera_leaves_the_equations_finite():
+    poses = Poses(np.array([np.eye(3)] * 2), np.array([[0, 0, 0], [0, 0, -0.5]]), 0.05)
+    landmarks = Landmarks.at(np.array([[340.0, 250]]), np.array([2.0]), 0, 2)
+    landmarks.observed[:, 1], landmarks.roots[:, 1] = True, np.eye(2)
+    observed = observe(K, poses, landmarks)
+    assert observed.place[0, 2] == 0
+    reduced = eliminate(observed, np.ones(1), 1.0, 2, lens=True)
+    assert np.isfinite(reduced.H).all() and np.isfinite(reduced.g).all()
+    assert np.isfinite(reduced.change(np.zeros(12))).all()
 
 
 def test_jacobians_are_those_of_finite_differences():
@@ -117,11 +140,26 @@ def test_elimination_equals_solving_the_full_system():
     assert step == pytest.approx(whole[:24], rel=1e-4, abs=1e-7)
     assert reduced.change(step).ravel() == pytest.approx(whole[24:], rel=1e-4, abs=1e-6)
     # With k1, and no other information: the gauge does not affect it.
+    bent = eliminate(observed, weights, 0.7, 4, lens=True)
+    assert np.allclose(bent.H, reduced.H, rtol=1e-6)
+    assert bent.g == pytest.approx(reduced.g, rel=1e-6, abs=1e-6)
+    assert bent.change(step) == pytest.approx(reduced.change(step), rel=1e-6, abs=1e-9)
     J = np.column_stack([of_k1.ravel(), J])
     information = np.linalg.pinv((J * W).T @ J, rcond=1e-11, hermitian=True)
-    marginal = eliminate(observed, weights, 0.7, 4, lens=True).marginal_k1()
+    marginal = bent.marginal_k1()
     assert marginal.curvature**-1 == pytest.approx(information[0, 0], rel=1e-3)
     assert marginal.step == pytest.approx(-(information @ (J * W).T @ e)[0], rel=1e-3)
+
+
+def test_without_observations_there_is_no_information_on_poses():
+    poses, landmarks = scene(np.random.default_rng(23))
+    landmarks.observed[:] = False
+    reduced = eliminate(observe(K, poses, landmarks), np.empty(0), 1.0, 4)
+    assert not reduced.H.any() and not reduced.g.any()
+    # The landmarks go back to where their patches were.
+    back = landmarks.moved(reduced.change(np.zeros(24)))
+    assert back.rho == pytest.approx(landmarks.rho)
+    assert back.points == pytest.approx(undistort(K, landmarks.anchor_pixels, 0.05), abs=0.1)
 
 
 def test_poses_and_depths_are_recovered_without_noise():
@@ -148,6 +186,44 @@ def test_removing_a_frame_removes_the_landmarks_anchored_in_it():
     assert not left.anchors.any()
     assert np.array_equal(left.minima, landmarks.minima[20:, 1:])
     assert landmarks.with_frame().observed.shape == (40, 5)
+
+
+def test_frames_that_come_and_go_leave_the_others_where_they_are():
+    poses, landmarks = scene(np.random.default_rng(18))
+    more, _ = scene(np.random.default_rng(18), frames=5)
+    poses, landmarks = poses.joined(more.R[4], more.t[4]), landmarks.with_frame()
+    landmarks.minima[:, 4] = projected(K, points_in_frame(K, more, landmarks, 4), more.k1)
+    landmarks.roots[:, 4], landmarks.observed[:, 4] = np.eye(2), True
+    for removed in (2, 0):
+        poses, landmarks = poses.without_frame(removed), landmarks.without_frame(removed)
+        observed = observe(K, poses, landmarks)
+        assert len(observed.residuals) >= 40
+        assert np.abs(observed.residuals).max() < 1e-9
+
+
+def test_observations_say_the_same_in_images_corrected_for_another_k1():
+    rng, before, after = np.random.default_rng(19), 0.03, -0.08
+    _, landmarks = scene(rng)
+    landmarks.slopes = rng.normal(size=(40, 2)) * 1e-3
+    off = rng.normal(size=(40, 2)) * 1e-3
+    beside = replace(landmarks, anchor_pixels=landmarks.anchor_pixels + off,
+                     minima=landmarks.minima + off[:, None])
+    corrected, next_to = (one.with_corrected_images(K, before, after)
+                          for one in (landmarks, beside))
+    for pixels, moved in ((landmarks.anchor_pixels, corrected.anchor_pixels),
+                          (landmarks.minima[:, 1], corrected.minima[:, 1])):
+        assert distort(K, moved, after) == pytest.approx(distort(K, pixels, before), abs=1e-3)
+    shift = next_to.anchor_pixels - corrected.anchor_pixels
+    assert np.abs(shift - off).max() > 1e-4
+    by_slopes = (np.einsum('ni,ni->n', one.slopes, way) for one, way in (
+        (corrected, shift), (landmarks, off)))
+    assert next(by_slopes) == pytest.approx(next(by_slopes), rel=1e-3, abs=1e-9)
+    assert np.einsum('nij,nj->ni', corrected.anchor_roots, shift) == pytest.approx(
+        np.einsum('nij,nj->ni', landmarks.anchor_roots, off), rel=1e-3, abs=1e-6)
+    shifts = next_to.minima - corrected.minima
+    assert np.einsum('nfij,nfj->nfi', corrected.roots, shifts) == pytest.approx(
+        np.einsum('nfij,nj->nfi', landmarks.roots, off), rel=1e-3, abs=1e-6)
+    assert corrected.points is landmarks.points
 
 
 def test_noise_of_the_anchor_patch_does_not_bias_steps():
@@ -181,15 +257,60 @@ def test_the_noise_estimate_accounts_for_degrees_of_freedom(frames):
         observed = observe(K, poses, landmarks)
         reduced = eliminate(observed, np.ones(len(observed.residuals)), 1.0, frames)
         landmarks = landmarks.moved(reduced.change(np.zeros(6 * frames)))
-    assert noise_scale(observe(K, poses, landmarks)) == pytest.approx(0.3, rel=0.05)
+    found = noise_scale(observe(K, poses, landmarks))
+    assert found == pytest.approx(0.3, rel=0.05)
+    # Landmarks that were only just created tell nothing.
+    new = replace(landmarks, observed=np.zeros_like(landmarks.observed))
+    assert noise_scale(observe(K, poses, landmarks.joined(new))) == found
+
+
+def random_prior(rng, frames):
+    """Return a prior that determines all of its poses, far from those it is linearised at."""
+    half = rng.normal(size=(6 * frames, 6 * frames))
+    return PosePrior(half @ half.T + np.eye(6 * frames), 9 * rng.normal(size=6 * frames), Poses(
+        rotation_exp(rng.normal(size=(frames, 3))), rng.normal(size=(frames, 3))))
 
 
 def test_the_gradient_of_a_prior_is_that_of_its_cost():
     rng = np.random.default_rng(7)
-    half = rng.normal(size=(12, 12))
-    since = Poses(rotation_exp(rng.normal(size=(2, 3))), rng.normal(size=(2, 3)))
-    prior = PosePrior(half @ half.T, rng.normal(size=12), since)
-    poses = since.moved(1e-4 * rng.normal(size=12))
+    prior = random_prior(rng, 2)
+    # As large as that at the start, although the step is small.
+    prior.H *= 1e5
+    poses = prior.linearised_at.moved(1e-4 * rng.normal(size=12))
     slopes = [(prior.at(poses.moved(step)).cost - prior.at(poses.moved(-step)).cost) / 2e-6
               for step in 1e-6 * np.eye(12)]
-    assert slopes == pytest.approx(prior.at(poses).gradient, abs=1e-2)
+    found = prior.at(poses).gradient
+    assert np.abs(found - prior.g).max() > 50
+    assert slopes == pytest.approx(found, rel=1e-3, abs=0.1)
+
+
+def test_information_is_added_to_a_prior_where_it_was_linearised():
+    rng = np.random.default_rng(20)
+    prior, added = random_prior(rng, 2), random_prior(rng, 2)
+    # Without a rotation steps are exact.
+    there, step = rng.normal(size=(2, 2, 6)) * [0, 0, 0, 1, 1, 1]
+    there, step = prior.linearised_at.moved(there), step.ravel()
+    costs = [prior.at(poses).cost for poses in (there, there.moved(step))]
+    prior.add(added.H, added.g, there)
+    more = [prior.at(poses).cost - cost for poses, cost in zip((there, there.moved(step)), costs)]
+    assert more[1] - more[0] == pytest.approx(step @ added.H @ step / 2 + added.g @ step)
+
+
+@pytest.mark.parametrize('frame', range(3))
+def test_without_a_frame_a_prior_keeps_minimum_and_covariance_of_the_others(frame):
+    prior, kept = random_prior(np.random.default_rng(21), 3), np.arange(3) != frame
+    left, columns = prior.without_frame(frame), np.repeat(kept, 6)
+    covariance = np.linalg.inv(prior.H)
+    assert np.linalg.inv(left.H) == pytest.approx(covariance[np.ix_(columns, columns)], rel=1e-3,
+                                                  abs=1e-5)
+    assert np.linalg.solve(left.H, left.g) == pytest.approx((covariance @ prior.g)[columns],
+                                                            rel=1e-3, abs=1e-4)
+    assert left.linearised_at.R.tolist() == prior.linearised_at.R[kept].tolist()
+    assert left.linearised_at.t.tolist() == prior.linearised_at.t[kept].tolist()
+
+
+def test_a_frame_without_information_comes_and_goes_without_effect_on_a_prior():
+    prior = random_prior(np.random.default_rng(22), 2)
+    left = prior.with_frame(np.eye(3), np.ones(3)).without_frame(2)
+    assert np.allclose(left.H, prior.H, rtol=1e-9)
+    assert left.g == pytest.approx(prior.g)

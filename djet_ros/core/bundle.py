@@ -489,7 +489,7 @@ def eliminate(observed: Observed, weights: Array, weight: float, frames: int,
             (o.residuals, o.R, o.t, o.ray, o.rho, o.place, o.root, weights),
             (o.normalised, o.anchor_roots, o.anchor_residuals, weight), lens,
             (o.K, inverse_intrinsics(o.K)), _tuning(o.k1), _DEPTH_INFORMATION, frames), lens)
-    count, n, linear = len(weights), len(observed.anchor_residuals), jacobians(observed)
+    n, linear = len(observed.anchor_residuals), jacobians(observed)
     size = lens + 6 * frames
     root = np.sqrt(weights)[:, None, None]
     by_frame, by_anchor = linear.by_frame * root, linear.by_anchor * root
@@ -508,15 +508,14 @@ def eliminate(observed: Observed, weights: Array, weight: float, frames: int,
     if lens:
         H[0, 0] += weight * (points_by_k1 * points_by_k1).sum()
         g[0] += weight * (points_by_k1 * observed.anchor_residuals).sum()
-    if count:
-        # Each frame observes a landmark once, and each landmark has one anchor.
-        coupling[observed.landmark, observed.frame] = back @ by_frame
-        first = np.flatnonzero(np.diff(observed.landmark, prepend=-1))
-        landmark, anchor = observed.landmark[first], observed.anchor[first]
-        coupling[landmark, anchor] = np.add.reduceat(back @ by_anchor, first)
-        information[landmark] += np.add.reduceat(back @ back.transpose(0, 2, 1), first)
-        slopes[landmark] += np.add.reduceat((back @ e[:, :, None])[:, :, 0], first)
-        with_k1[landmark] += np.add.reduceat(back @ by_k1, first)
+    # Each frame observes a landmark once, and each landmark has one anchor.
+    coupling[observed.landmark, observed.frame] = back @ by_frame
+    first = np.flatnonzero(np.diff(observed.landmark, prepend=-1))
+    landmark, anchor = observed.landmark[first], observed.anchor[first]
+    coupling[landmark, anchor] = np.add.reduceat(back @ by_anchor, first)
+    information[landmark] += np.add.reduceat(back @ back.transpose(0, 2, 1), first)
+    slopes[landmark] += np.add.reduceat((back @ e[:, :, None])[:, :, 0], first)
+    with_k1[landmark] += np.add.reduceat(back @ by_k1, first)
     coupled = np.concatenate(
         [with_k1[:, :, :lens], coupling.transpose(0, 2, 1, 3).reshape(n, 3, 6 * frames)], axis=2)
     variances = np.asarray(np.linalg.inv(information), float)
