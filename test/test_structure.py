@@ -704,6 +704,18 @@ def test_single_outliers_do_not_add_up_to_a_change():
     assert np.abs(logs).max() < 0.01
 
 
+def test_coarse_lengths_average_out_however_sure_the_factor_is():
+    """Each of 150 is off by 20 %, ten times as much as their mean."""
+    rng, squares = np.random.default_rng(2), []
+    for _ in range(40):
+        scale = ScaleFilter()
+        for metres in np.exp(rng.normal(0, 0.2, 150)):
+            scale.update(Length(metres, 0.2 * metres, True), 1.0, 0.0, 0.1)
+        squares.append(scale.log**2 / scale.variance)
+        assert np.sqrt(scale.variance) == pytest.approx(0.2 / np.sqrt(150), rel=1e-3)
+    assert 0.5 < np.mean(squares) < 1.6
+
+
 def metric(share=0.05):
     """Return the scale of a track after one length, of 3 m a unit: known to 2 %, and a share."""
     scale = ScaleFilter()
@@ -739,6 +751,37 @@ def test_metric_lengths_have_the_errors_of_factor_and_source_and_relative_ones_o
     assert length.sigma == pytest.approx(6 * np.sqrt(0.01**2 + 0.02**2 + 0.05**2))
     assert length.own.sigma == pytest.approx(0.01 * 6)
     assert length.common.variances == pytest.approx([0.02**2, 0.05**2])
+
+
+def test_a_length_as_its_source_measured_it_has_no_error_of_the_factor():
+    scale = metric()
+    assert scale.as_measured(Length(6.0, 0.3, True)).common.variances == pytest.approx(
+        [0.0, 0.05**2])
+    # What is not known has nothing in common with others.
+    unknown = Length(1.0, 1e3, False)
+    assert scale.as_measured(unknown) is unknown
+
+
+def test_after_a_reset_a_scale_is_as_if_it_were_new():
+    new, used = ScaleFilter(), metric()
+    new.configure(0.05)
+    for _ in range(7):
+        used.update(Length(12.0, 0.6, True), 2.0, 0.0, 0.1)
+    used.scaled(2.0, 0.01, False)
+    crept(used, 12, 0.5)
+    found = []
+    for scale in new, used:
+        scale.reset()
+        found.append([])
+        for metres in 0.0, 6.0, 12.0:
+            length = scale.scaled(2.0, 0.01, False)
+            found[-1] += [length.value, length.sigma, length.metric, *length.common.variances,
+                          *length.common.kept]
+            crept(scale, 12, 0.5)
+            scale.update(Length(metres, 0.05 * metres, True), 2.0, 0.0, 0.1)
+        found[-1].append(scale.factor)
+    assert found[0] == found[1]
+    assert found[0][5:7] == [1, 1]
 
 
 def test_a_factor_wanders_until_its_lengths_are_no_longer_metres():
@@ -785,6 +828,21 @@ def test_exact_lengths_leave_nothing_of_the_errors_before():
     assert np.sqrt(path.pose[2, 2]) == pytest.approx(0.1 * np.sqrt(25))
 
 
+def test_an_exact_length_makes_a_track_metric_at_once():
+    scale = ScaleFilter()
+    scale.update(Length(3.0, 0.0, True), 2.0, 0.01, 0.1, exact=True)
+    assert (scale.metric, scale.factor, scale.variance) == (True, pytest.approx(1.5), 0.0)
+
+
+def test_of_the_error_of_a_factor_that_two_lengths_correct_less_is_kept():
+    """Of a mean of equal lengths, the share of the first n is n over the number of all."""
+    scale = metric()
+    for kept in (0, 3 / 5, 5 / 7):
+        for _ in range(2):
+            scale.update(Length(6.0, 0.3, True), 2.0, 0.0, 0.1)
+        assert scale.scaled(2.0, 0.0, True).common.kept[0] == pytest.approx(kept)
+
+
 def crept(scale, steps, units, hertz=30):
     """Show steps of a millimetre, each as long as its standard deviation, in units of a track."""
     for _ in range(steps):
@@ -798,6 +856,32 @@ def test_lengths_that_may_be_noise_are_summed_for_a_second_and_no_longer():
         crept(scale, 3 * hertz, 0.5, hertz)
         assert scale.metric is significant
     assert scale.factor == pytest.approx(2e-3)
+
+
+def test_lengths_that_are_summed_count_once():
+    """Only seventeen of these are significant together."""
+    scale = ScaleFilter()
+    for number in range(1, 52):
+        scale.update(Length(1e-3, 1.01e-3, True), 0.5, 0.0, 0.01)
+        if number >= 17:
+            assert scale.variance == pytest.approx(1.01**2 / (number // 17 * 17))
+
+
+def test_a_length_that_is_significant_by_itself_is_not_added_to_noise_before_it():
+    """A speed is positive where noise is not: a camera that stands still seems to creep."""
+    scale = ScaleFilter()
+    crept(scale, 10, 0.0)
+    scale.update(Length(0.02, 1e-3, True), 2.0, 0.0, 0.03)
+    assert scale.factor == pytest.approx(0.01)
+    # What was significant is over: all that follows is summed anew.
+    crept(scale, 15, 0.05)
+    assert scale.variance == pytest.approx(0.05**2)
+
+
+def test_a_standstill_that_is_sure_says_nothing_about_the_scale():
+    scale = ScaleFilter()
+    scale.update(Length(0.0, 0.0, True), 2.0, 0.0, 0.1)
+    assert (scale.metric, scale.factor) == (False, 1.0)
 
 
 @pytest.mark.parametrize('change', ['share', 'unit'])
