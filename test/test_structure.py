@@ -9,7 +9,7 @@ from djet_ros.core.covariance import lift
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp, sphere_tangents
-from djet_ros.core.landmark_choice import PATCH, surrounding_means
+from djet_ros.core.landmark_choice import choose_landmarks, PATCH, surrounding_means
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Pose, RelativePose, Status, TRACKED
 from djet_ros.core.window import Window, WINDOW_TUNING, WindowStep
@@ -482,6 +482,36 @@ def test_landmarks_are_not_chosen_by_the_errors_of_their_own_depths(cards):
     chosen = np.log([at[tuple(x)] for x in window._landmarks.anchor_pixels])
     assert len(chosen) == 40
     assert abs(chosen.mean() - np.log(factors[pair.inliers]).mean()) < 3 * 0.5 / np.sqrt(40)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_each_cell_gets_a_landmark_before_any_gets_another_and_near_ones_come_first(seed):
+    rng, side = np.random.default_rng(seed), 40
+    x = rng.uniform(0, (800, 400), (3000, 2))
+    near = x[:, 0] > 400
+    # The right half is 64 times as near.
+    rho = np.where(near, 0.5, 0.5 / 64)
+    present = (0.5 + np.arange(20)[:, None] * [1, 0]) * side  # in each cell of the first row
+    cells, free = np.floor(x / side) @ [1, 20], x[:, 1] >= side
+    one_each = choose_landmarks(x, rho, present, side, 180)
+    assert free[one_each].all()
+    assert sorted(cells[one_each]) == list(range(20, 200))
+    # Those with near ones around them.
+    assert (x[choose_landmarks(x, rho, present, side, 72), 0] > 400 - 3 * PATCH).all()
+    assert not near[choose_landmarks(x, rho, present, side, 180)[120:]].any()
+    two_each = choose_landmarks(x, rho, present, side, 380)
+    assert (np.bincount(cells[two_each].astype(int)) == np.where(np.arange(200) < 20, 1, 2)).all()
+    everything = choose_landmarks(x, rho, present, side, 9000)
+    assert sorted(everything) == list(range(3000))
+    assert not len(choose_landmarks(x, rho, present, side, -3))
+
+
+def test_among_equally_near_points_the_first_in_a_cell_becomes_a_landmark():
+    rng = np.random.default_rng(4)
+    x, rho = rng.uniform(0, (800, 400), (3000, 2)), 2**rng.uniform(-3.4, -2.6, 3000)
+    _, first = np.unique(np.floor(x / 40) @ [1, 20], return_index=True)
+    chosen = choose_landmarks(x, rho, np.empty((0, 2)), 40, 200)
+    assert chosen.tolist() == sorted(first)
 
 
 def test_depth_around_a_patch_is_that_of_its_next_but_one_neighbours():
