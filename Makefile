@@ -84,7 +84,7 @@ $(VENV)/.installed: $(BUILT) | $(VENV)/bin/pip
 	$(VENV)/bin/pip install --quiet --editable .
 	touch $@
 
-# What the tests import is compiled as they do: a fifth of what is installed.
+# Python compiles what the tests import as they do, a fifth of what is installed.
 $(VENV)/.installed-%: $(BUILT) | $(VENV)/bin/pip
 	$(VENV)/bin/pip install --quiet --no-compile --editable '.[$*]'
 	touch $@

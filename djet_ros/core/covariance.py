@@ -260,7 +260,17 @@ def pose_difference(R: Array, t: Array, other: Pose) -> Array:
 def pose_differences(R: Array, t: Array, other_R: Array, other_t: Array) -> Array:
     """Return the differences (S, 5) of S motions, R (S, 3, 3) and t (S, 3), from one."""
     nearer = np.where(other_t @ t >= 0, 1.0, -1.0)[:, None] * other_t
-    return np.concatenate([rotation_log(other_R @ R.T), sphere_log(t, nearer)], axis=1)
+    return signed_differences(R, t, other_R, nearer)
+
+
+def signed_differences(R: Array, t: Array, other_R: Array, other_t: Array) -> Array:
+    """
+    Return the differences (..., 5) of motions whose signs of t are known from one, (R, t).
+
+    other_R: (..., 3, 3); other_t: (..., 3). These are the parameters of all covariances (5, 5):
+    the rotation vector from the left, and the arc of t.
+    """
+    return np.concatenate([rotation_log(other_R @ R.T), sphere_log(t, other_t)], axis=-1)
 
 
 def squared_distance(covariance: Array, offset: Array) -> float:

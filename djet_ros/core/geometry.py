@@ -90,11 +90,10 @@ def sphere_log(t: Array, other: Array) -> Array:
     Its length is the arc in rad. For opposite directions that is pi, and the direction is
     arbitrary.
     """
-    across, along = other @ sphere_tangents(t), other @ t
+    # Less than any rounding, but it gives the opposite direction a way to go.
+    across = other @ sphere_tangents(t) + (1e-150, 0.0)
     sines = norms(across)
-    arcs = np.arctan2(sines, along) / np.maximum(sines, 1e-300)
-    opposite = np.where((sines == 0) & (along < 0), np.pi, 0.0)
-    return np.asarray(across * arcs[..., None] + opposite[..., None] * (1.0, 0.0))
+    return np.asarray(across * (np.arctan2(sines, other @ t) / sines)[..., None])
 
 
 def inverse_intrinsics(K: Array) -> Array:

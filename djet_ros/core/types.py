@@ -155,7 +155,7 @@ class RelativePose:
     spans the alternatives: AMBIGUOUS if a very different motion explains the matches as well;
     TWO_MOTIONS if two bodies move and nothing decides which of them is the static world;
     TOO_FEW_INLIERS if false matches could produce as many inliers. covariance_5: (5, 5) over
-    (rotation vector in rad, arc in rad to the direction in the basis ``sphere_tangents(t)``);
+    (rotation vector in rad, arc of t in rad in the basis ``sphere_tangents(t)``);
     covariance_6: (6, 6) over (rotation vector, t), of rank 5 because t has unit length. If t is
     zeros, only the rotation blocks (3, 3) are meaningful: the rest belongs to the direction that
     was fitted first, which is not determined.

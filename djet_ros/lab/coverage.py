@@ -14,9 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
+from djet_ros.core.covariance import signed_differences
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.geometry import rotation_log, sphere_log, unit
+from djet_ros.core.geometry import unit
 from djet_ros.core.types import Array, RelativePose, Status, TRACKED
 from djet_ros.lab.pairs import has_failed, PairChunk
 from djet_ros.lab.scenes.sequence import rendered_scene
@@ -181,7 +182,7 @@ def normalised_square(pose: RelativePose, true_motion: Array) -> float:
     """
     R = true_motion[:3, :3].T
     t = unit(-R @ true_motion[:3, 3])
-    error = np.concatenate([rotation_log(R @ pose.R.T), sphere_log(pose.t, t)])
+    error = signed_differences(pose.R, pose.t, R, t)
     return float(error @ np.linalg.solve(pose.covariance_5, error))
 
 

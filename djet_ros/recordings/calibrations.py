@@ -97,7 +97,7 @@ def asl_camera(path: Path) -> tuple[Intrinsics, Array]:
         intrinsics = [float(value) for value in sensor['intrinsics']]
         distortion = [float(value) for value in sensor.get('distortion_coefficients', [])]
     except _UNFIT as error:
-        raise DjetError(f'{path} is no ASL camera description (intrinsics, T_BS): '
+        raise DjetError(f'{path} is no ASL camera description (intrinsics): '
                         f'{one_line(error)}') from error
     return _with_model(path, named, intrinsics, distortion), camera_in_body
 
