@@ -538,6 +538,26 @@ def test_pauses_with_hardly_any_motion_do_not_lose_the_scale(seed: int) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize('seed', [2, 3, 5])
+def test_reversing_while_turning_does_not_lose_the_scale(seed: int) -> None:
+    """At the turning point images determine no direction, and the usual speed is far too high."""
+    scene, odometry = make_scene('indoor', seed, (480, 360)), VisualOdometry(
+        EstimatorConfig(max_features=1000))
+    first, frames = scene.trajectory(2)[0], np.arange(30)
+    sideways = 0.004 * (frames - 14.3)**2
+    found = []
+    for frame, metres in enumerate(sideways):
+        camera = np.eye(4)
+        camera[:3, :3] = rotation_exp(np.radians([0.0, frame - 15.0, 0.0]))
+        camera[:3, 3] = metres, 0, -metres / 2
+        image = scene.render(first @ camera, frame)
+        result = odometry.process(Frame(image, scene.K, (frame + 1) * 10**8))
+        found.append(np.linalg.norm(result.motion[:3, 3]))
+    ratios = found[1:] / np.abs(np.diff(sideways))
+    assert np.median(ratios[-8:]) == pytest.approx(np.median(ratios[1:9]), rel=0.02)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', [0, 1, 4, 6])
 def test_fast_rotations_keep_the_scale(seed: int) -> None:
     """At 15 degrees a frame landmarks leave the view after a few, at times all at once."""

@@ -223,6 +223,25 @@ def test_steps_are_as_long_as_their_lengths_however_long_the_track(seed: int) ->
     assert np.std(off[-50:]) < np.median(sigmas)
 
 
+@pytest.mark.parametrize('guess', [3.0, 6.0])
+def test_an_uncertain_step_is_searched_by_depths_and_expected_by_the_guess(guess: float) -> None:
+    """A pair whose direction is hardly determined, and whose landmarks are not found either."""
+    street = Street(0, 20, 0.1)
+    window = NumbersWindow(street)
+    for _ in range(12):
+        window.go()
+    _, pair = street.pair(12)
+    searched = list[float]()
+
+    def observe_none() -> None:
+        searched.append(float(np.linalg.norm(window._poses.relative_motions[1][-1, -2])))
+
+    window._observe_landmarks = observe_none  # type: ignore[method-assign]
+    step = window.add(blank(), replace(pair, covariance_5=np.eye(5) * 0.05**2), guess)
+    assert abs(searched[0] - 1) < abs(searched[0] - guess)
+    assert step.length == pytest.approx(guess, rel=1e-3)
+
+
 def test_unpublished_motion_is_made_up_for_without_a_jump() -> None:
     window, here = NumbersWindow(Street(0, 40, 0.02)), np.eye(4)
     steps = []

@@ -14,7 +14,7 @@ before and after.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from djet_ros.core.bundle import (
     eliminate,
@@ -129,6 +129,25 @@ class WindowStep:
     corrected_motion: Array
 
 
+class _Measured(NamedTuple):
+    """A length and its standard deviation; noise may make a length of nearly zero negative."""
+
+    length: float
+    sigma: float
+
+    @property
+    def share(self) -> float:
+        """The standard deviation relative to the length."""
+        return self.sigma / self.length if self.length > 0 else np.inf
+
+    def fused(self, other: _Measured) -> _Measured:
+        """Return the mean of two, weighted by their variances, but no less than its deviation."""
+        weight = self.sigma**2 / (self.sigma**2 + other.sigma**2)
+        length = self.length + weight * (other.length - self.length)
+        sigma = np.sqrt(weight) * other.sigma
+        return _Measured(max(length, sigma), sigma)
+
+
 class Window:
     """
     Poses of keyframes and of the newest frame, and the inverse depths of their landmarks.
@@ -187,10 +206,11 @@ class Window:
         """
         # Predict by the pair, with a length from known depths.
         first = self.is_new
-        length, share = (guess, _UNIT_SIGMA) if first else self._length(relative, guess)
+        length, expected = ((guess, _Measured(guess, _UNIT_SIGMA * guess)) if first
+                            else self._length(relative, guess))
         self._cached_lengths = None
         self._append(view, relative, length)
-        self._add_pair(relative, length, share)
+        self._add_pair(relative, length, expected)
         # Observe old and new landmarks in the frame; then refine all.
         if self._is_keyframe[-2] and not self._has_landmarks[-2] and relative.t.any():
             self._create_landmarks(relative, length)
@@ -267,22 +287,31 @@ class Window:
         """Return the viewing rays (N, 3), with z = 1, of distorted pixels (N, 2)."""
         return undistorted_rays(self._K, pixels, self._poses.k1)
 
-    def _length(self, relative: RelativePose, guess: float) -> tuple[float, float]:
+    def _length(self, relative: RelativePose, guess: float) -> tuple[float, _Measured]:
         """
-        Return the length of the pair and its relative standard deviation.
+        Return the length at which to search for landmarks, and the expected one.
 
         By landmarks with a match nearby; if too few of them are in view, by the matches of the
-        previous pair, and then by matches around landmarks.
+        previous pair, and then by matches around landmarks. Where these hardly determine it, as
+        next to a standstill, the guess is expected; but by how far the length is off they still
+        say better: their error does not grow with the length, that of the guess does.
         """
-        unknown = guess, self._tuning.guess_sigma
-        if not relative.t.any():
-            return unknown
+        by_guess = _Measured(guess, self._tuning.guess_sigma * guess)
+        measured = self._measured(relative) if relative.t.any() else None
+        if measured is None:
+            return guess, by_guess
+        if measured.share >= self._tuning.guess_sigma:
+            return measured.fused(by_guess).length, by_guess
+        return measured.length, measured
+
+    def _measured(self, relative: RelativePose) -> _Measured | None:
+        """Return the length by points of known depth; None for few of them."""
         lengths = self._lengths_by_landmarks(relative)
         if len(lengths.values) < self._tuning.min_landmarks and self._latest is not None:
             lengths = KnownDepths.of_pair(self._K, self._poses.k1, *self._latest).lengths(relative)
         if len(lengths.values) < self._tuning.min_landmarks:
-            return self._length_around(self._known_depths(), relative) or unknown
-        return self._determined(lengths, self._tuning.length_sigma) or unknown
+            return self._measured_around(self._known_depths(), relative)
+        return self._median(lengths, self._tuning.length_sigma)
 
     def _scene_after(self, turn: Array) -> KnownDepths | None:
         """Return the depths around the newest frame as seen after a rotation (3, 3) of it."""
@@ -297,26 +326,21 @@ class Window:
 
         By the depths around the landmarks of the window before: the scene stays where it was.
         """
-        return None if self._scene is None else self._length_around(self._scene, relative)
+        measured = None if self._scene is None else self._measured_around(self._scene, relative)
+        determined = measured is not None and measured.share < self._tuning.guess_sigma
+        return (measured.length, measured.share) if measured and determined else None
 
-    def _length_around(self, known: KnownDepths, relative: RelativePose
-                       ) -> tuple[float, float] | None:
-        """Return the same by points of the neighbourhood, of which the pair may have no match."""
-        return self._determined(
-            known.lengths(relative, self._tuning.around * max(self._views[-1].gray.shape)),
-            self._tuning.around_sigma)
+    def _measured_around(self, known: KnownDepths, relative: RelativePose) -> _Measured | None:
+        """Return the length by points nearby, as the pair may have no match of the known ones."""
+        radius = self._tuning.around * max(self._views[-1].gray.shape)
+        return self._median(known.lengths(relative, radius), self._tuning.around_sigma)
 
-    def _determined(self, lengths: Lengths, share: float) -> tuple[float, float] | None:
-        """
-        Return a length and its relative standard deviation, at least a share.
-
-        None if there are few points, or if a guess is as good.
-        """
-        length = lengths.median() if len(lengths.values) >= self._tuning.min_landmarks else 0.0
-        if length <= 0:
+    def _median(self, lengths: Lengths, share: float) -> _Measured | None:
+        """Return the median with its standard deviation, at least a share; None for few points."""
+        if len(lengths.values) < self._tuning.min_landmarks:
             return None
-        sigma = float(np.hypot(share, lengths.noise() / length))
-        return (length, sigma) if sigma < self._tuning.guess_sigma else None
+        length = lengths.median()
+        return _Measured(length, float(np.hypot(share * length, lengths.noise())))
 
     def pair_length(self, relative: RelativePose) -> tuple[float, float] | None:
         """
@@ -388,12 +412,12 @@ class Window:
         self._views.append(view)
         self._landmarks = self._landmarks.with_frame()
 
-    def _add_pair(self, relative: RelativePose, length: float, share: float) -> None:
+    def _add_pair(self, relative: RelativePose, length: float, expected: _Measured) -> None:
         """
         Add the rotation and translation direction of the pair to the prior.
 
-        And its length, with a relative standard deviation: if landmarks hardly determine it, a
-        prior linearised elsewhere would move it arbitrarily.
+        And its expected length: if landmarks hardly determine it, a prior linearised elsewhere
+        would move it arbitrarily. length: at which the newest frame is now.
         """
         R, t = relative.R, length * relative.t
         # With steps (omega, upsilon) of the previous frame and of the new one, the motion rotates
@@ -404,14 +428,16 @@ class Window:
         J[:3, 6:9], J[3:, 6:9], J[3:, 9:] = np.eye(3), -skew(t), np.eye(3)
         if relative.t.any():
             J_pair = np.concatenate([J[:3], sphere_tangents(relative.t).T @ J[3:] / length])
-            along = relative.t @ J[3:] / (share * length)
+            along = relative.t @ J[3:] / expected.sigma
             information = (J_pair.T @ np.linalg.inv(relative.covariance_5) @ J_pair
                            + np.outer(along, along))
+            gradient = along * (length - expected.length) / expected.sigma
         else:
             information = J[:3].T @ J[:3] * _ROTATION_INFORMATION
-        H = np.zeros_like(self._prior.H)
-        H[-12:, -12:] = information
-        self._prior.add(H, np.zeros(len(H)), self._poses)
+            gradient = np.zeros(12)
+        H, g = np.zeros_like(self._prior.H), np.zeros_like(self._prior.g)
+        H[-12:, -12:], g[-12:] = information, gradient
+        self._prior.add(H, g, self._poses)
 
     def has_depths(self, relative: RelativePose) -> bool:
         """
