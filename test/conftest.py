@@ -38,6 +38,15 @@ def freiburg1_rpy(kitti: Path) -> Path:
     return folder
 
 
+@pytest.fixture(scope='session')
+def corridor(kitti: Path) -> Path:
+    """Folder of rendered frames of TartanAir: a corridor with exact truth, hard to track in."""
+    folder = kitti.parent / 'tartanair' / 'sequences' / 'indoor'
+    if not folder.is_dir():
+        pytest.skip(f'no frames of TartanAir: {folder} is not there')
+    return folder
+
+
 @pytest.fixture
 def small_kitti(tmp_path: Path) -> Callable[..., Path]:
     """Return a function that writes a sequence of noise images, and returns its folder."""

@@ -8,7 +8,7 @@ from itertools import pairwise
 import math
 from types import SimpleNamespace
 
-from djet_ros.core.basins import lowest_nearby_minimum
+from djet_ros.core.basins import likeliest, lowest_nearby_minimum
 from djet_ros.core.covariance import (
     lifted_covariance,
     pose_difference,
@@ -34,6 +34,7 @@ from djet_ros.core.rivals import (
     planar_twin,
     pose_distance,
     preferences,
+    PreviousMotion,
     Rival,
     unsigned_distance,
 )
@@ -41,7 +42,7 @@ from djet_ros.core.sketch import losses_at
 from djet_ros.core.starts import hemisphere_starts
 from djet_ros.core.surfaces import ReprojectionSurface
 from djet_ros.core.types import Pose, RelativePose, Status
-from djet_ros.core.verdict import _compare_with_rivals, as_pure_rotation
+from djet_ros.core.verdict import _compare_with_rivals, as_decided, as_pure_rotation
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -346,7 +347,7 @@ def test_points_off_a_plane_exclude_its_twin(off: float) -> None:
     assert not is_planar(x, y, NOISE)
 
 
-def estimate_predicted(x: np.ndarray, y: np.ndarray, prior: Pose) -> RelativePose:
+def estimate_predicted(x: np.ndarray, y: np.ndarray, prior: PreviousMotion) -> RelativePose:
     """Estimate from matches that were predicted by a previous motion."""
     return TwoViewEstimator(EstimatorConfig(method='rpe')).estimate_pair(
         Pair(uniform_view(), uniform_view(), x, y, prior, predicted=prior))
@@ -359,7 +360,8 @@ def test_a_predicted_pair_converges_as_with_all_starts(t: Sequence[float], off: 
     seen = two_views(rng, count=600, t=t)
     y = seen.y + rng.normal(0, NOISE, seen.y.shape)
     y[::5] += rng.uniform(-24, 24, y[::5].shape)  # false ones, as near as they are sought
-    one = estimate_predicted(seen.x, y, Pose(*moved_pose(seen.R, seen.t, off, rng)))
+    prior = PreviousMotion(*moved_pose(seen.R, seen.t, off, rng))
+    one = estimate_predicted(seen.x, y, prior)
     other = estimate(seen.x, y)
     assert one.status is other.status is Status.OK
     assert rotation_angle(one.R, other.R) < 1e-4
@@ -370,7 +372,7 @@ def test_a_wrong_prediction_still_finds_the_right_motion() -> None:
     for seed in range(5):
         rng = np.random.default_rng(seed)
         seen = two_views(rng, count=600, t=FORWARD)
-        wrong = Pose(seen.R, unit(np.asarray(SIDEWAYS)))
+        wrong = PreviousMotion(seen.R, unit(np.asarray(SIDEWAYS)))
         result = estimate_predicted(seen.x, seen.y + rng.normal(0, NOISE, seen.y.shape), wrong)
         assert result.status is Status.OK
         assert direction_angle(result.t, seen.t) < 0.02
@@ -379,8 +381,48 @@ def test_a_wrong_prediction_still_finds_the_right_motion() -> None:
 def test_a_distant_prediction_does_not_decide() -> None:
     x, y = plane_of_two_motions()
     guess = estimate(x, y)
-    distant = Pose(guess.R, -unit(np.cross(guess.t, (0.3, 0.8, 0.1))))
+    distant = PreviousMotion(guess.R, -unit(np.cross(guess.t, (0.3, 0.8, 0.1))))
     assert estimate_predicted(x, y, distant).status is Status.AMBIGUOUS
+
+
+def test_what_the_pair_before_left_open_it_does_not_decide() -> None:
+    """Two motions that fit about equally, the second a bit better."""
+    rng = np.random.default_rng(0)
+    places, losses = rng.uniform((0, 0), SIZE, (400, 2)), rng.uniform(size=(2, 400))
+    losses[1] += 0.03 + (losses[0] - losses[1]).mean()
+    losses = losses[::-1]
+    turned = rotation_exp(np.array([0.0, 0.02, 0.0]))
+    one, other = Pose(np.eye(3), np.array([0, 0, 1.0])), Pose(turned, np.array([0.6, 0, 0.8]))
+    assert losses[0].mean() > losses[1].mean()
+
+    def chosen(*undecided: Pose) -> int:
+        return likeliest(losses, places, [one, other], PreviousMotion(one.R, one.t, undecided))
+
+    assert likeliest(losses, places, [one, other], None) == 1
+    assert chosen() == 0
+    assert chosen(other) == chosen(Pose(turned, -other.t)) == 1
+    # Motions that the pair before left open, but neither of these.
+    assert chosen(Pose(np.eye(3), np.array([-0.8, 0, 0.6]))) == 0
+    assert chosen(Pose(np.eye(3), unit(np.array([0.03, 0, 1.0])))) == 0
+
+
+def test_a_predicted_pair_is_also_sought_where_the_pair_before_left_it_open() -> None:
+    """From a rotation so far off no start around the prediction leads to the right one."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        seen = two_views(rng, count=600, t=SIDEWAYS)
+        y = seen.y + rng.normal(0, NOISE, seen.y.shape)
+        wrong = rotation_exp(np.array([3.0, 0.0, 0.0])) @ seen.R
+        found = [estimate_predicted(seen.x, y, PreviousMotion(wrong, unit(np.ones(3)), undecided))
+                 for undecided in ((), (Pose(*moved_pose(seen.R, seen.t, 0.03, rng)),))]
+        assert rotation_angle(found[0].R, seen.R) > 0.01
+        assert rotation_angle(found[1].R, seen.R) < 1e-3
+
+
+def test_a_motion_is_undecided_as_long_as_the_matches_do_not_prefer_another() -> None:
+    unsure = estimate(*plane_of_two_motions())
+    assert unsure.undecided and set(map(id, unsure.undecided)) <= set(map(id, unsure.rivals))
+    assert not as_decided(unsure).undecided
 
 
 def test_points_in_general_position_have_no_rivals() -> None:

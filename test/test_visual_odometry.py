@@ -667,3 +667,22 @@ def test_the_estimated_distortion_is_forgotten_for_another_camera(cards, gap):
     result = vo.process(replace(frame, gray=frame.gray[:-20].copy()))
     assert result.status is (Status.SIZE_CHANGED if gap < 1 else Status.TIME_JUMP)
     assert vo.estimator.k1 == 0
+
+
+def test_a_wrong_motion_at_the_start_does_not_last(corridor):
+    """
+    Between textureless walls the first pairs of a camera on its side fit two motions.
+
+    Each later pair has a slight preference for the right one.
+    """
+    sequence, odometry = KittiSequence(corridor, end=16), VisualOdometry()
+    K, side = sequence.K.copy(), np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    K[0, 2], K[1, 2] = sequence.size[1] - 1 - sequence.K[1, 2], sequence.K[0, 2]
+    errors = []
+    for index in range(16):
+        image = np.ascontiguousarray(np.rot90(sequence.image(index), -1))
+        result = odometry.process(Frame(image, K, index + 1))
+        if index:
+            true = np.linalg.inv(sequence.poses[index - 1]) @ sequence.poses[index]
+            errors.append(direction_angle(result.motion[:3, 3], side @ true[:3, 3]))
+    assert np.degrees(np.nanmedian(errors[5:])) < 3

@@ -47,7 +47,13 @@ from djet_ros.core.joining import fuse_alignment
 from djet_ros.core.pair import Limits, Pair, Round
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
 from djet_ros.core.patches import Aligned, unaligned
-from djet_ros.core.rivals import pose_distance, refined_rivals, Rival, unsigned_distance
+from djet_ros.core.rivals import (
+    pose_distance,
+    PreviousMotion,
+    refined_rivals,
+    Rival,
+    unsigned_distance,
+)
 from djet_ros.core.sketch import losses_in_front, refine_all
 from djet_ros.core.slants import slopes_of_all
 from djet_ros.core.surfaces import (
@@ -189,12 +195,12 @@ class Algorithm:
         self._plausible, self._on_motion = np.ones(count, bool), np.ones(count, bool)
         self._warp: Array | None = None
 
-    def rerun(self, start: Pose, predicted: Pose | None = None,
+    def rerun(self, start: Pose, predicted: PreviousMotion | None = None,
               alive: NDArray[np.bool_] | None = None) -> Track | None:
         """Run the algorithm afresh from a single pose, on the matches in a mask (N,) or all."""
         return Algorithm(self.pair, self.surface, self.config, alive).run([start], predicted)
 
-    def run(self, starts: list[Pose], predicted: Pose | None = None,
+    def run(self, starts: list[Pose], predicted: PreviousMotion | None = None,
             limits: Limits | None = None) -> Track | None:
         """
         Make rounds until the pose converges; None if too few matches have a surface.
@@ -271,7 +277,7 @@ class Algorithm:
         return np.asarray(self._alive & self._plausible & self._on_motion & within)
 
     def _optimised(self, paraboloids: Paraboloids, voting: NDArray[np.bool_], poses: list[Pose],
-                   predicted: Pose | None, by_points: bool) -> OptimisedPose:
+                   predicted: PreviousMotion | None, by_points: bool) -> OptimisedPose:
         """Choose a basin among the starting poses and optimise the pose in it."""
         config, x = self.config, self.surface.x.compress(voting, axis=0)
         problem = jet_problem(self._K, x, paraboloids.of(voting), config.epipole_blur,

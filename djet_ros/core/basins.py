@@ -21,6 +21,7 @@ from djet_ros.core.jet import (
 from djet_ros.core.paraboloid import median, quantile
 from djet_ros.core.rivals import (
     preferences,
+    PreviousMotion,
     refined_rivals,
     Rival,
     SIGNIFICANT_PREFERENCE,
@@ -119,7 +120,7 @@ class Basin:
 
 
 def choose_basin(problem: JetProblem, places: Array, starts: list[Pose],
-                 config: EstimatorConfig, prior: Pose | None,
+                 config: EstimatorConfig, prior: PreviousMotion | None,
                  measured: MeasuredRotation | None) -> Basin:
     """
     Choose the basin of the camera's motion among starts and a hemisphere of directions.
@@ -148,7 +149,8 @@ def choose_basin(problem: JetProblem, places: Array, starts: list[Pose],
 
 
 def _refine_and_choose(problem: JetProblem, places: Array, starts: list[Pose], tight: Loss,
-                       prior: Pose | None, measured: MeasuredRotation | None = None) -> Basin:
+                       prior: PreviousMotion | None, measured: MeasuredRotation | None = None
+                       ) -> Basin:
     """Refine starts on all matches, and choose the one of least cost as in `choose_basin`."""
     refined = refine_all(problem, starts, tight, BASIN_TUNING.steps_to_compare)
     possible, camera_in_minority = np.ones(len(refined), bool), False
@@ -164,7 +166,7 @@ def _refine_and_choose(problem: JetProblem, places: Array, starts: list[Pose], t
     return Basin(best, max(scale, MIN_SCALE), residuals, camera_in_minority, tuple(basins))
 
 
-def choose_predicted_basin(problem: JetProblem, places: Array, predicted: Pose,
+def choose_predicted_basin(problem: JetProblem, places: Array, predicted: PreviousMotion,
                            config: EstimatorConfig) -> Basin:
     """
     Choose among the basins around the predicted motion: its own, and a hemisphere of directions.
@@ -176,7 +178,7 @@ def choose_predicted_basin(problem: JetProblem, places: Array, predicted: Pose,
     """
     subset = problem.subset(subsampled(len(problem.blur), BASIN_TUNING.matches_predicted))
     tight = Loss()
-    basins = starts = starts_around(predicted, BASIN_TUNING.directions)
+    basins = starts = [*starts_around(predicted, BASIN_TUNING.directions), *predicted.undecided]
     for steps in (0, *BASIN_TUNING.steps_predicted):
         refined = refine_all(subset, basins, tight, steps)
         tight = _tight_loss(config, _noise(refined))
@@ -227,7 +229,7 @@ def basin_of(problem: JetProblem, pose: Pose) -> Basin:
 
 
 def choose_among_rivals(problem: JetProblem, places: Array, solution: Solution,
-                        rivals: Sequence[Pose], loss: Loss, prior: Pose | None
+                        rivals: Sequence[Pose], loss: Loss, prior: PreviousMotion | None
                         ) -> tuple[Solution, tuple[Rival, ...]]:
     """Choose the likeliest of a solution and its rivals, with its preferences over the others."""
     poses = [solution.pose, *refined_rivals(problem, rivals, loss)]
@@ -328,9 +330,12 @@ def _distinct(poses: Sequence[Pose], solution: Solution, information: Array, bou
     return kept
 
 
-def likeliest(losses: Array, places: Array, poses: Sequence[Pose], prior: Pose | None) -> int:
+def likeliest(losses: Array, places: Array, poses: Sequence[Pose],
+              prior: PreviousMotion | None) -> int:
     """
     Return which of S poses costs least, or the nearest to the prior of those undecided.
+
+    Unless the prior, which may be in the wrong basin itself, leaves that open.
 
     losses: (S, N) of the matches at the poses; places: (N, 2) their pixels.
     """
@@ -338,8 +343,9 @@ def likeliest(losses: Array, places: Array, poses: Sequence[Pose], prior: Pose |
     if prior is None:
         return best
     undecided = preferences(losses, places, best) < SIGNIFICANT_PREFERENCE
-    return min(np.flatnonzero(undecided).tolist(),
-               key=lambda index: unsigned_distance(prior, poses[index]))
+    nearest = min(np.flatnonzero(undecided).tolist(),
+                  key=lambda index: unsigned_distance(prior, poses[index]))
+    return best if prior.leaves_open(poses[nearest], poses[best]) else nearest
 
 
 def _has_rotation(measured: MeasuredRotation, sketch: Sketch) -> NDArray[np.bool_]:

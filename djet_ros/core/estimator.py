@@ -22,7 +22,7 @@ from djet_ros.core.memory import keep_freed_memory
 from djet_ros.core.pair import Limits, Observer, Pair
 from djet_ros.core.parallel import run_both
 from djet_ros.core.radial import undistort_image
-from djet_ros.core.rivals import MIN_BODY_SHARE
+from djet_ros.core.rivals import MIN_BODY_SHARE, PreviousMotion
 from djet_ros.core.starts import (
     external_starts,
     five_point,
@@ -129,7 +129,7 @@ class TwoViewEstimator:
             (x, y), bits, motion = predicted
             limits = _limits_from(prior)
             result = self.estimate_pair(Pair(
-                previous, current, x, y, _prior_pose(prior), known, motion, limits, bits,
+                previous, current, x, y, _previous_motion(prior), known, motion, limits, bits,
                 sought=len(previous.features), timings=timings))
             if _within_limits(result, limits):
                 return result
@@ -137,13 +137,17 @@ class TwoViewEstimator:
         # Otherwise match in the whole search radius.
         with _timed(timings, 'matching'):
             x, y = match_widely(previous, current, prior, known, self.config.search_radius)
-        pair = Pair(previous, current, x, y, _prior_pose(prior), known,
+        pair = Pair(previous, current, x, y, _previous_motion(prior), known,
                     sought=len(previous.features.with_additional), timings=timings)
         result = self.estimate_pair(pair)
         # If another body moved in the previous pair, go on with the one that it followed: by now
         # most matches may be of the other one, or fit a compromise.
         followed = None if prior is None else self._estimate_followed(pair, prior)
-        return result if followed is None or _is_same(followed, result) else followed
+        if followed is None or _is_same(followed, result):
+            return result
+        # Unless all matches go on by a motion that the previous pair left open.
+        is_open = pair.prior is not None and pair.prior.leaves_open(_pose(followed), _pose(result))
+        return result if is_open else followed
 
     def _estimate_followed(self, pair: Pair, prior: RelativePose) -> RelativePose | None:
         """
@@ -178,7 +182,7 @@ class TwoViewEstimator:
         x, y = (np.asarray(places, np.float64) for places in (x, y))
         if not (np.isfinite(x).all() and np.isfinite(y).all()):
             raise ValueError('matches must be finite; remove those that were not found')
-        return self.estimate_pair(Pair(previous, current, x, y, _prior_pose(prior),
+        return self.estimate_pair(Pair(previous, current, x, y, _previous_motion(prior),
                                        observe=observe, covariances=covariances))
 
     def estimate_near(self, previous: View, current: View, relative: RelativePose, start: Pose,
@@ -190,8 +194,9 @@ class TwoViewEstimator:
         ``estimate``.
         """
         return self.estimate_pair(Pair(
-            previous, current, relative.x, relative.y, start, known or KnownMotion(), start=start,
-            sought=relative.sought, timings=relative.timings))
+            previous, current, relative.x, relative.y, PreviousMotion(start.R, start.t),
+            known or KnownMotion(), start=start, sought=relative.sought,
+            timings=relative.timings))
 
     def estimate_pair(self, pair: Pair) -> RelativePose:
         """Estimate the motion of a ``Pair``: its matches and all prior knowledge."""
@@ -336,9 +341,14 @@ def _is_same(one: RelativePose, other: RelativePose) -> bool:
                      pose_difference(one.R, one.t, Pose(other.R, other.t)))
 
 
-def _prior_pose(prior: RelativePose | None) -> Pose | None:
-    """Return the prior as a starting pose, if its translation direction is known."""
-    return Pose(prior.R, prior.t) if prior is not None and prior.t.any() else None
+def _pose(relative: RelativePose) -> Pose:
+    return Pose(relative.R, relative.t)
+
+
+def _previous_motion(prior: RelativePose | None) -> PreviousMotion | None:
+    """Return the motion of the prior, if its translation direction is known."""
+    known = prior is not None and prior.t.any()
+    return PreviousMotion(prior.R, prior.t, prior.undecided) if prior and known else None
 
 
 @contextmanager

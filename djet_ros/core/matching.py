@@ -20,8 +20,9 @@ from djet_ros.core.prediction import (
     predict_constant_motion,
     search_radius_after,
 )
+from djet_ros.core.rivals import PreviousMotion
 from djet_ros.core.starts import KnownMotion
-from djet_ros.core.types import Array, Pose, RelativePose, View
+from djet_ros.core.types import Array, RelativePose, View
 import numpy as np
 from numpy.typing import NDArray
 
@@ -63,7 +64,7 @@ class PredictedMatches(NamedTuple):
 
     matches: Matches
     bits: Array
-    motion: Pose
+    motion: PreviousMotion
 
 
 def match_predicted(previous: View, current: View, prior: RelativePose | None, known: KnownMotion,
@@ -78,7 +79,8 @@ def match_predicted(previous: View, current: View, prior: RelativePose | None, k
             or prior.inliers.sum() < _MIN_MATCHES or prior.inliers.mean() < MIN_RIGID_SHARE):
         return None
     reach = min(flow_reach(NEAR_LEVELS), search_radius * max(current.gray.shape))
-    motion = Pose(prior.R if known.guess is None else known.guess.R, prior.t)
+    motion = (PreviousMotion(prior.R, prior.t, prior.undecided) if known.guess is None
+              else PreviousMotion(known.guess.R, prior.t))
     predicted = predict_constant_motion(previous.features, current.K, motion.R, prior)
     y, bits = track_features(previous, current, predicted, reach, NEAR_LEVELS)
     tracked = np.isfinite(bits)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from djet_ros.core.paraboloid import Paraboloids
+from djet_ros.core.rivals import PreviousMotion
 from djet_ros.core.starts import KnownMotion
 from djet_ros.core.types import Array, Pose, View
 import numpy as np
@@ -65,9 +66,9 @@ class Pair:
     current: View
     x: Array
     y: Array
-    prior: Pose | None = None
+    prior: PreviousMotion | None = None
     known: KnownMotion = field(default_factory=KnownMotion)
-    predicted: Pose | None = None
+    predicted: PreviousMotion | None = None
     limits: Limits = field(default_factory=Limits)
     bits: Array | None = None
     covariances: Array | None = None

@@ -7,7 +7,7 @@ half of the image, each half has its own motion.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -109,8 +109,28 @@ def unsigned_distance(one: Pose, other: Pose) -> float:
 
 def continues_motion(prior: Pose, one: Pose, other: Pose) -> bool:
     """Return whether a motion is close to the previous one, and another clearly less so."""
-    near = pose_distance(prior, one)
-    return near < _MAX_CHANGE and 2 * near < pose_distance(prior, other)
+    return _continues(pose_distance, prior, one, other)
+
+
+def _continues(distance: Callable[[Pose, Pose], float], prior: Pose, one: Pose, other: Pose
+               ) -> bool:
+    near = distance(prior, one)
+    return near < _MAX_CHANGE and 2 * near < distance(prior, other)
+
+
+@dataclass(frozen=True)
+class PreviousMotion(Pose):
+    """
+    The motion of the pair before, and others between which its matches do not decide.
+
+    A pair that may itself be in the wrong basin must not lead the next ones there.
+    """
+
+    undecided: tuple[Pose, ...] = ()
+
+    def leaves_open(self, one: Pose, other: Pose) -> bool:
+        """Return whether the other motion, and not the one, continues one of these."""
+        return any(_continues(unsigned_distance, each, other, one) for each in self.undecided)
 
 
 def preferences(losses: Array, places: Array, chosen: int) -> Array:

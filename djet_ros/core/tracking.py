@@ -23,6 +23,7 @@ from djet_ros.core.rivals import (
     motion_without_attached,
     planar_twin,
     preferences,
+    PreviousMotion,
     Rival,
     second_motion,
     SecondMotion,
@@ -78,7 +79,7 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
     return _camera_of_two_motions(algorithm, track, noise)
 
 
-def _best_basin(algorithm: Algorithm, track: Track, predicted: Pose | None) -> Track:
+def _best_basin(algorithm: Algorithm, track: Track, predicted: PreviousMotion | None) -> Track:
     """
     Return the best basin after each has converged, if there may be a better one.
 

@@ -171,7 +171,8 @@ class RelativePose:
     culled: number of matches without a usable surface in the end; indefinite: number of surfaces
     without a minimum; iterations: rounds of Algorithm 1; timings: stage -> seconds; rivals: other
     motions, up to the sign of t and beyond own_covariance_5, that the matches do not exclude
-    beyond doubt, and the pose with -t if they do not exclude that;
+    beyond doubt, and the pose with -t if they do not exclude that; undecided: those of the rivals
+    that the matches do not decide against at all;
     own_covariance_5: (5, 5) covariance_5 as it is without any rival; sought: number of features of
     the previous image that were searched, 0 if matches were given.
     """
@@ -196,5 +197,6 @@ class RelativePose:
     iterations: int = 0
     timings: dict[str, float] = field(default_factory=dict)
     rivals: tuple[Pose, ...] = ()
+    undecided: tuple[Pose, ...] = ()
     own_covariance_5: Array = field(default_factory=lambda: np.full((5, 5), np.nan))
     sought: int = 0

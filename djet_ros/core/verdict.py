@@ -38,6 +38,7 @@ from djet_ros.core.rivals import (
     false_alarms,
     pose_distance,
     preferences,
+    Rival,
     SIGNIFICANT_PREFERENCE,
 )
 from djet_ros.core.types import Array, Pose, RelativePose, Status
@@ -82,7 +83,7 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
                               None if pair.bits is None else (pair.y, pair.bits))
 
     status, R, t, count = Status.OK, pose.R, pose.t, int(inliers.sum())
-    own_covariance, rivals = covariance, list[Pose]()
+    own_covariance, rivals = covariance, list[Rival]()
     if (count < config.min_matches or not np.isfinite(covariance).all()
             or _random_descriptors(hamming[inliers])):
         status, t = Status.DEGENERATE, np.zeros(3)
@@ -105,7 +106,8 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
     covariance_6 = lifted_covariance(covariance, pose.t) if determined else UNDETERMINED[1]
 
     lines = epipolar_lines(fundamental(K, R, track.pose.t), pair.x)
-    opposite = [Pose(R, -t)] if sign_open and t.any() else []
+    if sign_open and t.any():
+        rivals.append(Rival(Pose(R, -t), 0.0))
     return RelativePose(
         status, R, t, covariance, covariance_6, x=pair.x, y=pair.y, placed=track.placed.places,
         placed_covariances=track.placed.covariances,
@@ -113,14 +115,16 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
         residuals=line_distances(lines, pair.y),
         hamming=hamming, losses=track.losses, culled=int((~track.voting).sum()),
         indefinite=track.indefinite, iterations=track.iterations, timings=pair.timings,
-        sought=pair.sought, rivals=(*rivals, *opposite),
+        sought=pair.sought, rivals=tuple(rival.pose for rival in rivals),
+        undecided=tuple(rival.pose for rival in rivals
+                        if rival.preference < SIGNIFICANT_PREFERENCE),
         own_covariance_5=own_covariance)
 
 
 def as_decided(relative: RelativePose) -> RelativePose:
     """Return a pair as OK without rivals, as other evidence than its images excludes them."""
     own = relative.own_covariance_5
-    return replace(relative, status=Status.OK, rivals=(), covariance_5=own,
+    return replace(relative, status=Status.OK, rivals=(), undecided=(), covariance_5=own,
                    covariance_6=lifted_covariance(own, relative.t))
 
 
@@ -216,7 +220,7 @@ def _covariance(track: Track, pose: Pose, x: Array, flipped: bool) -> Array:
 
 def _compare_with_rivals(pose: Pose, covariance: Array, track: Track, x: Array,
                          prior: Pose | None, sign_open: bool
-                         ) -> tuple[Status, Array, list[Pose]]:
+                         ) -> tuple[Status, Array, list[Rival]]:
     """
     Compare a pose with its rivals.
 
@@ -229,7 +233,7 @@ def _compare_with_rivals(pose: Pose, covariance: Array, track: Track, x: Array,
     """
     status = Status.TWO_MOTIONS if track.body_ambiguous else Status.OK
     undecided_covariances: list[Array] = []
-    possible: list[Pose] = []
+    possible: list[Rival] = []
     for rival in (*track.rivals, *track.nearby):
         offset = pose_difference(pose.R, pose.t, rival.pose)
         if is_within(covariance, offset):
@@ -241,7 +245,7 @@ def _compare_with_rivals(pose: Pose, covariance: Array, track: Track, x: Array,
         if track.body_ambiguous or rival.preference < _NEGLIGIBLE_PREFERENCE:
             probability = float(ndtr(-rival.preference / _OVERSTATEMENT))
             covariance = widened_to_span(covariance, offset, probability)
-            possible.append(rival.pose)
+            possible.append(rival)
         if undecided:
             undecided_covariances.append(_covariance_of(rival.pose, track, x))
     # Only after all rivals were compared: the uncertainty of one rival must not make another one

@@ -137,7 +137,7 @@ class _Measured(NamedTuple):
 
     @property
     def share(self) -> float:
-        """The standard deviation relative to the length."""
+        """Return the standard deviation relative to the length."""
         return self.sigma / self.length if self.length > 0 else np.inf
 
     def fused(self, other: _Measured) -> _Measured:
