@@ -79,9 +79,11 @@ def test_slopes_are_in_gray_levels_per_pixel():
     rows, columns = np.mgrid[:60, :60]
     # The gradient is 3 along x and 4 along y, in alternating quarters of the image.
     saw = np.where((rows // 2 + columns // 2) % 2 == 0, 3 * columns, 4 * rows) % 200
-    assert corner_slopes(saw.astype(np.uint8)).max() > 1
+    assert corner_slopes(saw.astype(np.uint8))[0].max() > 1
     ramp = (3 * columns).astype(np.uint8)
-    assert corner_slopes(ramp)[5:25, 5:25].max() == 0
+    slopes, steepness = corner_slopes(ramp)
+    assert slopes[5:25, 5:25].max() == 0
+    np.testing.assert_allclose(steepness[5:25, 5:25], 3**2)
 
 
 def test_points_have_room_for_a_descriptor(image):
@@ -188,14 +190,38 @@ def test_slopes_do_not_depend_on_memory_alignment():
     for _ in range(20):
         noise, seen, held = rng.integers(0, 256, (50, 70), dtype=np.uint8), set(), []
         for size in rng.integers(1, 2000, 20):
-            seen.add(corner_slopes(noise).tobytes())
+            seen.add(np.stack(corner_slopes(noise)).tobytes())
             held.append(np.empty(size))
         assert len(seen) == 1
 
 
 @pytest.mark.parametrize('rows', [20, 52, 96])
 def test_slopes_do_not_depend_on_distant_rows(image, rows):
-    whole, below = corner_slopes(image), corner_slopes(image[2 * rows:])
-    # At a border, gradients use mirrored pixels.
-    assert np.array_equal(whole[rows + 2:], below[2:])
-    assert below[2:].any()
+    for whole, below in zip(corner_slopes(image), corner_slopes(image[2 * rows:])):
+        # At a border, gradients use mirrored pixels.
+        assert np.array_equal(whole[rows + 2:], below[2:])
+        assert below[2:].any()
+
+
+@pytest.mark.parametrize('quality', [60, 80, 95])
+def test_ripples_of_compression_around_edges_are_no_corners(quality):
+    """JPEG makes dozens along each side of a bright square, but its corners are found."""
+    plain = cv2.GaussianBlur(np.full((400, 400), 110, np.uint8), (0, 0), 1)
+    square = np.rint(cv2.boxPoints(((200, 200), (150, 150), 20))).astype(int)
+    cv2.fillPoly(plain, [square], 200, cv2.LINE_AA)
+    _, data = cv2.imencode('.jpg', plain, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    found = detect_corners(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), 500, 1.0)
+    distances = np.linalg.norm(found.points[:, None] - square, axis=2)
+    assert (distances.min(0) < 4).all()
+    assert (distances.min(1) < 12).mean() > 0.8
+
+
+def test_weak_corners_away_from_edges_are_found():
+    """A faint texture covers the left side, a checkerboard a part of the right one."""
+    rng = np.random.default_rng(0)
+    faint = 110 + 4 * cv2.resize(rng.normal(size=(50, 60)), (600, 500)).clip(-2, 2)
+    strong = faint.copy()
+    strong[100:400, 330:570] = np.kron(np.indices((10, 8)).sum(0) % 2, np.full((30, 30), 200))
+    for image in (faint, strong):
+        points = detect_corners(np.rint(image).astype(np.uint8), 2000, 0.3).points
+        assert (points[:, 0] < 300).sum() > 60

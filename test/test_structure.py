@@ -15,7 +15,7 @@ from djet_ros.core.types import Pose, RelativePose, Status, TRACKED
 from djet_ros.core.window import Window, WINDOW_TUNING, WindowStep
 from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.result import camera_motion
+from djet_ros.odometry.result import camera_motion, OdometryResult
 from djet_ros.odometry.scale import (
     ConstantScale,
     Length,
@@ -195,9 +195,9 @@ def test_a_rotation_in_place_does_not_change_the_expected_length(cards):
     assert drive.odometry._scale._speed == expected
 
 
-@pytest.mark.slow
-def test_a_rotation_beyond_all_landmarks_leaves_the_scale_to_one_guess():
-    scene = make_scene('indoor', 0, (320, 240))
+def rotated_on_the_spot(seed: int) -> tuple[VisualOdometry, list[OdometryResult]]:
+    """Go on for six frames indoors, and then rotate by 100 degrees."""
+    scene = make_scene('indoor', seed, (320, 240))
     poses, turn = list(scene.trajectory(6)), pose(yaw=0.06)
     for _ in range(30):
         poses.append(poses[-1] @ turn)
@@ -205,9 +205,24 @@ def test_a_rotation_beyond_all_landmarks_leaves_the_scale_to_one_guess():
     results = [odometry.process(Frame(scene.render(there, i), scene.K, 10**9 + i * 10**8))
                for i, there in enumerate(poses)]
     assert all(result.scale_known for result in results[1:])
-    # Landmarks come into view one after the other, and carry the scale beyond the field of view.
-    factors = [result.common.variances[0] for result in results[1:23] if result.common]
-    assert len(factors) == 22 and max(factors) < 0.01
+    return odometry, results
+
+
+@pytest.mark.slow
+def test_in_a_rotation_landmarks_carry_the_scale_beyond_the_field_of_view():
+    """They come into view one after the other; in one of these rooms a wall is nearly blank."""
+    worst = []
+    for seed in range(5):
+        _, results = rotated_on_the_spot(seed)
+        factors = [result.common.variances[0] for result in results[1:23] if result.common]
+        assert len(factors) == 22
+        worst.append(max(factors))
+    assert np.median(worst) < 0.003 and max(worst) < 0.04
+
+
+@pytest.mark.slow
+def test_a_rotation_beyond_all_landmarks_leaves_the_scale_to_one_guess():
+    odometry, results = rotated_on_the_spot(0)
     # At a blank corner there are too few landmarks to determine a length, and a usual step is the
     # guess, once for all frames without any.
     assert any(result.status not in TRACKED for result in results[23:])
@@ -252,13 +267,17 @@ def test_a_bad_frame_does_not_change_the_scale(cards):
     assert np.linalg.norm(bridged.motion[:3, 3]) == pytest.approx(2, rel=0.05)
 
 
-def test_the_usual_speed_is_a_mean_over_half_a_second(cards):
+def test_the_usual_speed_is_a_mean_over_half_a_second_unless_a_step_is_well_known(cards):
     drive = Drive(cards)
     drive.go([pose(x=0.16, z=0.12)] * 6)
-    assert drive.odometry._scale._speed == pytest.approx(10, rel=0.03)  # units per second
-    drive.go([pose(x=0.08, z=0.06)])  # half as fast
-    assert drive.odometry._scale._speed == pytest.approx(
-        10 - 5 * (1 - np.exp(-0.1 / 0.5)), rel=0.03)
+    scale = drive.odometry._scale
+    assert scale._speed == pytest.approx(10, rel=0.03)  # units per second
+    # Half as fast, by a rough estimate, and then by images.
+    rough = WindowStep(np.eye(3), np.array([0, 0, 0.5]), 0.5, 0.2, np.eye(6), np.eye(4))
+    scale._wander(rough, 0.1, parallax=True)
+    assert scale._speed == pytest.approx(10 - 5 * (1 - np.exp(-0.1 / 0.5)), rel=0.03)
+    drive.go([pose(x=0.08, z=0.06)])
+    assert scale._speed == pytest.approx(5, rel=0.03)
 
 
 @pytest.mark.slow

@@ -224,8 +224,10 @@ def test_steps_are_as_long_as_their_lengths_however_long_the_track(seed: int) ->
 
 
 @pytest.mark.parametrize('guess', [3.0, 6.0])
-def test_an_uncertain_step_is_searched_by_depths_and_expected_by_the_guess(guess: float) -> None:
-    """A pair whose direction is hardly determined, and whose landmarks are not found either."""
+@pytest.mark.parametrize('found_by_guess', [0, 30, 60])
+def test_an_uncertain_step_is_searched_where_landmarks_are_and_expected_by_the_guess(
+        guess: float, found_by_guess: int) -> None:
+    """A pair whose direction is hardly determined; its landmarks cannot be observed in the end."""
     street = Street(0, 20, 0.1)
     window = NumbersWindow(street)
     for _ in range(12):
@@ -236,9 +238,14 @@ def test_an_uncertain_step_is_searched_by_depths_and_expected_by_the_guess(guess
     def observe_none() -> None:
         searched.append(float(np.linalg.norm(window._poses.relative_motions[1][-1, -2])))
 
+    def count_found(view: Any, relative: RelativePose, length: float) -> int:
+        assert length == guess or 1 < length < guess
+        return found_by_guess if length == guess else 100
+
     window._observe_landmarks = observe_none  # type: ignore[method-assign]
-    step = window.add(blank(), replace(pair, covariance_5=np.eye(5) * 0.05**2), guess)
-    assert abs(searched[0] - 1) < abs(searched[0] - guess)
+    window._count_found = count_found  # type: ignore[method-assign]
+    step = window.add(blank(), replace(pair, covariance_5=np.eye(5) * 0.035**2), guess)
+    assert (searched[0] < 0.99 * guess) == (found_by_guess < 50)
     assert step.length == pytest.approx(guess, rel=1e-3)
 
 

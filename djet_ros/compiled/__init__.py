@@ -27,7 +27,7 @@ Images = Sequence[tuple[NDArray[Any], int]]
 
 # Version of the C interface, see interface.c: an editable install may have newer sources than its
 # build.
-_INTERFACE = 10
+_INTERFACE = 11
 
 _NO_BYTES = c_char * 0
 _FLOAT64 = np.dtype(np.float64)
@@ -125,7 +125,8 @@ def graded_surfaces(reference: NDArray[np.int16], image: NDArray[np.int16],
     return distances
 
 
-def corner_slopes(image: NDArray[np.uint8], least_ratio: float, unit: float) -> Gray:
+def corner_slopes(image: NDArray[np.uint8], least_ratio: float, unit: float
+                  ) -> tuple[Gray, Gray]:
     """
     Return mean square gradients (H / 2, W / 2) of blocks: `core.corners.corner_slopes`.
 
@@ -133,12 +134,13 @@ def corner_slopes(image: NDArray[np.uint8], least_ratio: float, unit: float) -> 
     direction; unit: of the result.
     """
     height, width = image.shape
-    slopes = np.empty((height // 2, width // 2), np.float32)
+    slopes, steepness = np.empty((2, height // 2, width // 2), np.float32)
     _call('djet_corner_slopes', _ptr(image, np.uint8), c_int(height), c_int(width),
           c_float(least_ratio), c_float(unit),
           _ptr(np.empty((_CORNER_ROWS, width // 2 + 1), np.int32), np.int32),
-          _ptr(np.empty((4, width + 2), np.int16), np.int16), _ptr(slopes, np.float32))
-    return slopes
+          _ptr(np.empty((4, width + 2), np.int16), np.int16),
+          *(_ptr(each, np.float32) for each in (slopes, steepness)))
+    return slopes, steepness
 
 
 def peaks(slopes: Gray, least: float, margin: int, after: tuple[int, int]

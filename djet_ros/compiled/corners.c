@@ -57,9 +57,10 @@ INLINE void add_rows(const int32_t *a, const int32_t *b, const int32_t *c, int n
     sums[n + 1] = sums[n - 1];
 }
 
-/* Corner strengths of a row of blocks, by sums (3, n + 2) of products over three rows of pairs. */
+/* Corner strengths and steepness of a row of blocks, by sums (3, n + 2) of products over three rows
+   of pairs. */
 INLINE void to_slopes(const int32_t *sums, int n, float least_ratio, float unit,
-                      float *restrict slopes)
+                      float *restrict slopes, float *restrict steepness)
 {
     const int32_t *xx = sums, *xy = xx + n + 2, *yy = xy + n + 2;
     for (int j = 0; j < n; j++) {
@@ -70,14 +71,16 @@ INLINE void to_slopes(const int32_t *sums, int n, float least_ratio, float unit,
         const float spread = sqrtf(difference * difference + mean_xy * mean_xy * 4);
         const float least = trace - spread, most = (trace + spread) * least_ratio;
         slopes[j] = (least < most ? 0 : least) * unit;
+        steepness[j] = (trace + spread) * unit;
     }
 }
 
 /* Mean square gradients (height / 2, width / 2) of blocks in their weakest direction, 0 if that
-   is less than a share of the strongest one: core.corners.corner_slopes. height, width: even;
-   sums, rows: scratch memory (12, width / 2 + 1) and (4, width + 2). */
+   is less than a share of the strongest one, and in the strongest: core.corners.corner_slopes.
+   height, width: even; sums, rows: scratch memory (12, width / 2 + 1) and (4, width + 2). */
 WIDE void djet_corner_slopes(const uint8_t *image, int height, int width, float least_ratio,
-                             float unit, int32_t *sums, int16_t *rows, float *slopes)
+                             float unit, int32_t *sums, int16_t *rows, float *slopes,
+                             float *steepness)
 {
     const int n = width / 2, blocks = height / 2;
     int16_t *smoothed = rows, *differences = smoothed + width + 2, *dx = differences + width + 2,
@@ -103,7 +106,8 @@ WIDE void djet_corner_slopes(const uint8_t *image, int height, int width, float 
         for (int p = 0; p < PRODUCTS; p++)
             add_rows(near[0] + p * n, near[1] + p * n, near[2] + p * n, n,
                      of_three + p * (n + 2));
-        to_slopes(of_three, n, least_ratio, unit, slopes + (int64_t)(row - 1) * n);
+        const int64_t first = (int64_t)(row - 1) * n;
+        to_slopes(of_three, n, least_ratio, unit, slopes + first, steepness + first);
     }
 }
 

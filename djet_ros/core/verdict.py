@@ -122,9 +122,13 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
 
 
 def as_decided(relative: RelativePose) -> RelativePose:
-    """Return a pair as OK without rivals, as other evidence than its images excludes them."""
+    """
+    Return a pair as OK and as sure as without its rivals, which other evidence excludes.
+
+    It keeps them: the evidence may be the pair before, which may be wrong itself.
+    """
     own = relative.own_covariance_5
-    return replace(relative, status=Status.OK, rivals=(), undecided=(), covariance_5=own,
+    return replace(relative, status=Status.OK, covariance_5=own,
                    covariance_6=lifted_covariance(own, relative.t))
 
 

@@ -91,6 +91,9 @@ class WindowTuning:
     # guess; landmarks that both frames observe determine it far better
     length_sigma: float = 0.02
     guess_sigma: float = 0.5
+    # chosen: and up to which a less certain length still bounds the guess. Beyond, it may be all
+    # error: with a rolling shutter lengths would shrink ever more
+    bounding_sigma: float = 0.67
     # chosen: share of the larger image side within which points have about the same depth, and the
     # relative standard deviation of a length by such neighbours, besides that of its noise: after
     # a frame between, lengths differed by 1 to 2 % on streets and indoors
@@ -140,12 +143,10 @@ class _Measured(NamedTuple):
         """Return the standard deviation relative to the length."""
         return self.sigma / self.length if self.length > 0 else np.inf
 
-    def fused(self, other: _Measured) -> _Measured:
-        """Return the mean of two, weighted by their variances, but no less than its deviation."""
+    def fused(self, other: _Measured) -> float:
+        """Return the mean of both lengths, weighted by their variances."""
         weight = self.sigma**2 / (self.sigma**2 + other.sigma**2)
-        length = self.length + weight * (other.length - self.length)
-        sigma = np.sqrt(weight) * other.sigma
-        return _Measured(max(length, sigma), sigma)
+        return self.length + weight * (other.length - self.length)
 
 
 class Window:
@@ -207,7 +208,7 @@ class Window:
         # Predict by the pair, with a length from known depths.
         first = self.is_new
         length, expected = ((guess, _Measured(guess, _UNIT_SIGMA * guess)) if first
-                            else self._length(relative, guess))
+                            else self._length(view, relative, guess))
         self._cached_lengths = None
         self._append(view, relative, length)
         self._add_pair(relative, length, expected)
@@ -287,22 +288,39 @@ class Window:
         """Return the viewing rays (N, 3), with z = 1, of distorted pixels (N, 2)."""
         return undistorted_rays(self._K, pixels, self._poses.k1)
 
-    def _length(self, relative: RelativePose, guess: float) -> tuple[float, _Measured]:
+    def _length(self, view: View, relative: RelativePose, guess: float
+                ) -> tuple[float, _Measured]:
         """
-        Return the length at which to search for landmarks, and the expected one.
+        Return the length at which to search for landmarks in a view, and the expected one.
 
         By landmarks with a match nearby; if too few of them are in view, by the matches of the
-        previous pair, and then by matches around landmarks. Where these hardly determine it, as
-        next to a standstill, the guess is expected; but by how far the length is off they still
-        say better: their error does not grow with the length, that of the guess does.
+        previous pair, and then by matches around landmarks. Where these hardly determine it, the
+        guess is expected. But next to a standstill it may be far too long, and hardly any landmark
+        where it predicts them; then they are sought at the mean of both lengths.
         """
         by_guess = _Measured(guess, self._tuning.guess_sigma * guess)
         measured = self._measured(relative) if relative.t.any() else None
         if measured is None:
             return guess, by_guess
-        if measured.share >= self._tuning.guess_sigma:
-            return measured.fused(by_guess).length, by_guess
-        return measured.length, measured
+        if measured.share < self._tuning.guess_sigma:
+            return measured.length, measured
+        if measured.share > self._tuning.bounding_sigma:
+            return guess, by_guess
+        shorter = measured.fused(by_guess)
+        found = [self._count_found(view, relative, length) for length in (guess, shorter)]
+        return guess if found[0] > found[1] / 2 else shorter, by_guess
+
+    def _count_found(self, view: View, relative: RelativePose, length: float) -> int:
+        """Count the landmarks that are found in a view after a pair of some length."""
+        poses = self._poses.joined(*self._moved(relative, length))
+        sighted = Sighting(self._distances, self._K, [*self._views, view], poses,
+                           self._landmarks.with_frame()).observe(self._config.window // 2)
+        return 0 if sighted is None else len(sighted.indices)
+
+    def _moved(self, relative: RelativePose, length: float) -> tuple[Array, Array]:
+        """Return the pose R (3, 3), t (3,) after a pair of some length."""
+        R, t = self._poses.R[-1], self._poses.t[-1]
+        return relative.R @ R, relative.R @ t + length * relative.t
 
     def _measured(self, relative: RelativePose) -> _Measured | None:
         """Return the length by points of known depth; None for few of them."""
@@ -403,8 +421,7 @@ class Window:
         self._is_keyframe[-1] = due
 
     def _append(self, view: View, relative: RelativePose, length: float) -> None:
-        R, t = self._poses.R[-1], self._poses.t[-1]
-        new = relative.R @ R, relative.R @ t + length * relative.t
+        new = self._moved(relative, length)
         self._poses, self._prior = self._poses.joined(*new), self._prior.with_frame(*new)
         # The second frame is a keyframe, since it defines the unit.
         self._is_keyframe.append(self.is_new)

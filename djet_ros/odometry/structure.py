@@ -22,8 +22,10 @@ from djet_ros.odometry.scale_filter import ScaleFilter
 import numpy as np
 from scipy.special import bdtr
 
-# Seconds; chosen: the usual speed is a mean over so long, as single steps may be far off.
-_USUAL_OVER = 0.5
+# Seconds; chosen: the usual speed is a mean over so long, as single steps may be far off. Steps of
+# less than this relative standard deviation are not: a camera that brakes is soon much slower than
+# its mean, and where that predicts landmarks there are none.
+_USUAL_OVER, _WELL_KNOWN = 0.5, 0.05
 
 # Standard deviation of the log length of the first step after an interruption of the track, by
 # the usual speed before: the camera may continue faster or slower.
@@ -271,7 +273,7 @@ class TrackScale:
         if self._speed is None:
             self._speed = addition.length / seconds
         elif parallax:
-            share = 1 - np.exp(-seconds / _USUAL_OVER)
+            share = max(1 - np.exp(-seconds / _USUAL_OVER), 1 / (1 + (own / _WELL_KNOWN)**2))
             self._speed += share * (addition.length / seconds - self._speed)
         else:
             usual = max(usual, self._speed * seconds)
