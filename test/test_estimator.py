@@ -588,7 +588,7 @@ def test_basins_are_compared_after_each_is_refined_with_its_own_warps(corridor: 
 def test_two_poses_of_equal_cost_are_ambiguous(corridor: Path):
     """Which of them is taken depends on the corners that OpenCV's version finds."""
     result, near = pair_from_the_truth(corridor, 152)
-    held = [Pose(result.R, result.t), *result.rivals]
+    held = [Pose(result.R, result.t), *(rival.pose for rival in result.rivals)]
     assert min(np.degrees(rotation_angle(pose.R, near.R)) for pose in held) < 0.1
     assert min(np.degrees(direction_angle(pose.t, near.t)) for pose in held) < 2
     off = pose_difference(result.R, result.t, near)

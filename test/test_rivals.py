@@ -35,13 +35,12 @@ from djet_ros.core.rivals import (
     pose_distance,
     preferences,
     PreviousMotion,
-    Rival,
     unsigned_distance,
 )
 from djet_ros.core.sketch import losses_at
 from djet_ros.core.starts import hemisphere_starts
 from djet_ros.core.surfaces import ReprojectionSurface
-from djet_ros.core.types import Pose, RelativePose, Status
+from djet_ros.core.types import Pose, RelativePose, Rival, Status
 from djet_ros.core.verdict import _compare_with_rivals, as_decided, as_pure_rotation
 import numpy as np
 import pytest
@@ -246,7 +245,7 @@ def test_an_equally_likely_motion_makes_a_pose_ambiguous() -> None:
     # other.
     assert result.t.any()
     assert np.sqrt(np.trace(result.covariance_5[3:, 3:])) > 0.1
-    assert min(abs(rival.t @ result.t) for rival in result.rivals) < 0.9
+    assert min(abs(rival.pose.t @ result.t) for rival in result.rivals) < 0.9
     assert np.sqrt(np.trace(result.own_covariance_5[3:, 3:])) < 0.1
 
 
@@ -421,8 +420,17 @@ def test_a_predicted_pair_is_also_sought_where_the_pair_before_left_it_open() ->
 
 def test_a_motion_is_undecided_as_long_as_the_matches_do_not_prefer_another() -> None:
     unsure = estimate(*plane_of_two_motions())
-    assert unsure.undecided and set(map(id, unsure.undecided)) <= set(map(id, unsure.rivals))
-    assert as_decided(unsure).undecided == unsure.undecided
+    assert len(PreviousMotion.of(unsure).undecided) == len(unsure.rivals)
+    sure = replace(unsure, rivals=tuple(replace(rival, preference=2.4) for rival in unsure.rivals))
+    assert not PreviousMotion.of(sure).undecided
+
+
+@pytest.mark.parametrize(('preference', 'kept'), [(-1.1, True), (-0.9, False), (2.0, False)])
+def test_a_decided_pair_keeps_the_rivals_that_its_matches_prefer(
+        preference: float, kept: bool) -> None:
+    unsure = estimate(*plane_of_two_motions())
+    rivals = tuple(replace(rival, preference=preference) for rival in unsure.rivals)
+    assert as_decided(replace(unsure, rivals=rivals)).rivals == (rivals if kept else ())
 
 
 def test_points_in_general_position_have_no_rivals() -> None:

@@ -11,7 +11,7 @@ from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp, sphere_tangents
 from djet_ros.core.landmark_choice import choose_landmarks, PATCH, surrounding_means
 from djet_ros.core.self_calibration import SelfCalibration
-from djet_ros.core.types import Pose, RelativePose, Status, TRACKED
+from djet_ros.core.types import Pose, RelativePose, Rival, Status, TRACKED
 from djet_ros.core.window import Window, WINDOW_TUNING, WindowStep
 from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
@@ -414,6 +414,7 @@ def test_the_depths_of_landmarks_decide_on_the_status_of_a_pair(cards):
     for one, rivals, status in (
             (pair, (other,), Status.OK), (pair, (other, aside), Status.AMBIGUOUS),
             (pair, (), Status.OK), (wrong, (other,), Status.AMBIGUOUS)):
+        rivals = tuple(Rival(rival, 0.0) for rival in rivals)
         assert verified(replace(one, status=Status.AMBIGUOUS, rivals=rivals), CARDS_K
                         ).status is status
     # A rotation, for which the direction of noise was taken.

@@ -6,7 +6,7 @@ import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.geometry import direction_angle, rotation_angle, unit
 from djet_ros.core.three_views import consistent_motion, of_followed_body
-from djet_ros.core.types import Pose, RelativePose, Status
+from djet_ros.core.types import Pose, RelativePose, Rival, Status
 from djet_ros.lab.scenes.catalogue import make_scene
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.visual_odometry import VisualOdometry
@@ -58,7 +58,8 @@ def of_motions(pair: RelativePose, *motions: Pose) -> RelativePose:
     """Return the pair with the first of some motions as its pose, and the others as rivals."""
     first, *rivals = motions
     return RelativePose(Status.AMBIGUOUS, first.R, first.t, x=pair.x, y=pair.y,
-                        inliers=pair.inliers, residuals=pair.residuals, rivals=tuple(rivals))
+                        inliers=pair.inliers, residuals=pair.residuals,
+                        rivals=tuple(Rival(rival, 0.0) for rival in rivals))
 
 
 @pytest.mark.parametrize('seed', range(20))

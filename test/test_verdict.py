@@ -76,7 +76,7 @@ def test_a_pure_rotation_may_be_as_wrong_as_the_motion_it_replaces() -> None:
 
 def test_the_opposite_motion_is_a_rival_while_its_sign_is_open() -> None:
     unsure = estimate(pair_of(*open_sign()))
-    assert any(np.allclose(rival.R, unsure.R) and np.allclose(rival.t, -unsure.t)
+    assert any(np.allclose(rival.pose.R, unsure.R) and np.allclose(rival.pose.t, -unsure.t)
                for rival in unsure.rivals)
     seen, y = noisy_views(4)
     assert not estimate(pair_of(seen.x, y)).rivals
@@ -85,7 +85,7 @@ def test_the_opposite_motion_is_a_rival_while_its_sign_is_open() -> None:
 def test_a_pair_that_other_evidence_decides_is_as_sure_as_without_its_rivals() -> None:
     unsure = estimate(pair_of(*open_sign()))
     decided = as_decided(unsure)
-    assert decided.status is Status.OK and decided.rivals == unsure.rivals
+    assert decided.status is Status.OK and not decided.rivals
     assert np.trace(unsure.covariance_5[3:, 3:]) > 1 > 100 * np.trace(decided.covariance_5)
 
 

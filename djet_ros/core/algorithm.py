@@ -51,7 +51,6 @@ from djet_ros.core.rivals import (
     pose_distance,
     PreviousMotion,
     refined_rivals,
-    Rival,
     unsigned_distance,
 )
 from djet_ros.core.sketch import losses_in_front, refine_all
@@ -62,7 +61,7 @@ from djet_ros.core.surfaces import (
     ResidualSurface,
     resolve_indefinite,
 )
-from djet_ros.core.types import Array, Pose
+from djet_ros.core.types import Array, Pose, Rival
 import numpy as np
 from numpy.typing import NDArray
 

@@ -23,7 +23,6 @@ from djet_ros.core.rivals import (
     preferences,
     PreviousMotion,
     refined_rivals,
-    Rival,
     SIGNIFICANT_PREFERENCE,
     unsigned_distance,
 )
@@ -36,7 +35,7 @@ from djet_ros.core.sketch import (
     Sketch,
 )
 from djet_ros.core.starts import hemisphere_starts, starts_around, subsampled
-from djet_ros.core.types import Array, Pose
+from djet_ros.core.types import Array, Pose, Rival
 import numpy as np
 from numpy.typing import NDArray
 

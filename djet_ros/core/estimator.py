@@ -347,8 +347,7 @@ def _pose(relative: RelativePose) -> Pose:
 
 def _previous_motion(prior: RelativePose | None) -> PreviousMotion | None:
     """Return the motion of the prior, if its translation direction is known."""
-    known = prior is not None and prior.t.any()
-    return PreviousMotion(prior.R, prior.t, prior.undecided) if prior and known else None
+    return PreviousMotion.of(prior) if prior is not None and prior.t.any() else None
 
 
 @contextmanager

@@ -79,7 +79,7 @@ def match_predicted(previous: View, current: View, prior: RelativePose | None, k
             or prior.inliers.sum() < _MIN_MATCHES or prior.inliers.mean() < MIN_RIGID_SHARE):
         return None
     reach = min(flow_reach(NEAR_LEVELS), search_radius * max(current.gray.shape))
-    motion = (PreviousMotion(prior.R, prior.t, prior.undecided) if known.guess is None
+    motion = (PreviousMotion.of(prior) if known.guess is None
               else PreviousMotion(known.guess.R, prior.t))
     predicted = predict_constant_motion(previous.features, current.K, motion.R, prior)
     y, bits = track_features(previous, current, predicted, reach, NEAR_LEVELS)

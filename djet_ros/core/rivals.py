@@ -16,7 +16,7 @@ from djet_ros.core.geometry import chirality_signs, inverse_depths, norms, rays,
 from djet_ros.core.jet import clipped_scale, JetProblem, Loss, robust_scale
 from djet_ros.core.sketch import losses_in_front, refine_all, Sketch
 from djet_ros.core.starts import starts_around, subsampled
-from djet_ros.core.types import Array, Pose
+from djet_ros.core.types import Array, Pose, RelativePose, Rival
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
@@ -64,14 +64,6 @@ DEEP_RATIO = 0.25
 
 # chosen: noise of an inverse depth over the near end; above, noise would make a plane look deep.
 _MAX_DEPTH_NOISE = 0.1
-
-
-@dataclass(frozen=True)
-class Rival:
-    """Another motion, and by how many standard deviations the matches prefer the chosen one."""
-
-    pose: Pose
-    preference: float
 
 
 @dataclass(frozen=True)
@@ -127,6 +119,12 @@ class PreviousMotion(Pose):
     """
 
     undecided: tuple[Pose, ...] = ()
+
+    @classmethod
+    def of(cls, pair: RelativePose) -> PreviousMotion:
+        """Return the motion of a pair."""
+        return cls(pair.R, pair.t, tuple(rival.pose for rival in pair.rivals
+                                         if rival.preference < SIGNIFICANT_PREFERENCE))
 
     def leaves_open(self, one: Pose, other: Pose) -> bool:
         """Return whether the other motion, and not the one, continues one of these."""

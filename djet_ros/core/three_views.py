@@ -55,9 +55,9 @@ def consistent_motion(before: RelativePose, current: RelativePose, K: Array) -> 
     x, y = x[match], y[match]
     if len(x) < _MIN_POINTS:
         return None
-    motions = [Pose(current.R, current.t), *current.rivals]
+    motions = _motions_of(current)
     known = [_depths_after(before, motion, K, shared)
-             for motion in (Pose(before.R, before.t), *before.rivals)]
+             for motion in _motions_of(before)]
     seen = [inverse_depths(motion.R, motion.t, rays(K, x), rays(K, y)) for motion in motions]
     errors = K[0, 0] * np.stack([_disagreement(depths, triangulated)
                                  for depths, triangulated in product(known, seen)])
@@ -72,6 +72,10 @@ def consistent_motion(before: RelativePose, current: RelativePose, K: Array) -> 
     others = np.arange(len(errors)) % len(motions) != chosen
     decided = (preferences(losses, x, best)[others] >= SIGNIFICANT_PREFERENCE).all()
     return motions[chosen] if decided else None
+
+
+def _motions_of(pair: RelativePose) -> list[Pose]:
+    return [Pose(pair.R, pair.t), *(rival.pose for rival in pair.rivals)]
 
 
 def _depths_after(pair: RelativePose, motion: Pose, K: Array, shared: NDArray[np.bool_]

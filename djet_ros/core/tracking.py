@@ -24,14 +24,13 @@ from djet_ros.core.rivals import (
     planar_twin,
     preferences,
     PreviousMotion,
-    Rival,
     second_motion,
     SecondMotion,
     SIGNIFICANT_PREFERENCE,
     unsigned_distance,
 )
 from djet_ros.core.surfaces import ResidualSurface
-from djet_ros.core.types import Pose
+from djet_ros.core.types import Pose, Rival
 import numpy as np
 from numpy.typing import NDArray
 

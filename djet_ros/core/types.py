@@ -146,6 +146,14 @@ class Pose:
 
 
 @dataclass(frozen=True)
+class Rival:
+    """Another motion, and by how many standard deviations the matches prefer the chosen one."""
+
+    pose: Pose
+    preference: float
+
+
+@dataclass(frozen=True)
 class RelativePose:
     """
     The estimated motion between two frames, ``x_current = R x_previous + t``, and its evidence.
@@ -171,8 +179,7 @@ class RelativePose:
     culled: number of matches without a usable surface in the end; indefinite: number of surfaces
     without a minimum; iterations: rounds of Algorithm 1; timings: stage -> seconds; rivals: other
     motions, up to the sign of t and beyond own_covariance_5, that the matches do not exclude
-    beyond doubt, and the pose with -t if they do not exclude that; undecided: those of the rivals
-    that the matches do not decide against at all;
+    beyond doubt, and the pose with -t if they do not exclude that;
     own_covariance_5: (5, 5) covariance_5 as it is without any rival; sought: number of features of
     the previous image that were searched, 0 if matches were given.
     """
@@ -196,7 +203,6 @@ class RelativePose:
     indefinite: int = 0
     iterations: int = 0
     timings: dict[str, float] = field(default_factory=dict)
-    rivals: tuple[Pose, ...] = ()
-    undecided: tuple[Pose, ...] = ()
+    rivals: tuple[Rival, ...] = ()
     own_covariance_5: Array = field(default_factory=lambda: np.full((5, 5), np.nan))
     sought: int = 0

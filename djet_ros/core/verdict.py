@@ -38,10 +38,9 @@ from djet_ros.core.rivals import (
     false_alarms,
     pose_distance,
     preferences,
-    Rival,
     SIGNIFICANT_PREFERENCE,
 )
-from djet_ros.core.types import Array, Pose, RelativePose, Status
+from djet_ros.core.types import Array, Pose, RelativePose, Rival, Status
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
@@ -60,6 +59,9 @@ _OVERSTATEMENT = 2.0
 # Preference (4.66) above which a rival is too improbable to widen the covariance: one in a
 # hundred.
 _NEGLIGIBLE_PREFERENCE = _OVERSTATEMENT * SIGNIFICANT_PREFERENCE
+
+# Preference, a standard deviation, with which matches cast doubt on what other evidence decided.
+_DOUBT = 1.0
 
 # rad; limit of the distance of two motions that one covariance can span: the sphere of directions
 # is curved, and up to here arc and sine agree to a twentieth.
@@ -115,9 +117,7 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
         residuals=line_distances(lines, pair.y),
         hamming=hamming, losses=track.losses, culled=int((~track.voting).sum()),
         indefinite=track.indefinite, iterations=track.iterations, timings=pair.timings,
-        sought=pair.sought, rivals=tuple(rival.pose for rival in rivals),
-        undecided=tuple(rival.pose for rival in rivals
-                        if rival.preference < SIGNIFICANT_PREFERENCE),
+        sought=pair.sought, rivals=tuple(rivals),
         own_covariance_5=own_covariance)
 
 
@@ -125,10 +125,12 @@ def as_decided(relative: RelativePose) -> RelativePose:
     """
     Return a pair as OK and as sure as without its rivals, which other evidence excludes.
 
-    It keeps them: the evidence may be the pair before, which may be wrong itself.
+    Rivals that its matches prefer are kept for the next pair to consider: the other evidence is
+    the pair before, which may be wrong itself.
     """
     own = relative.own_covariance_5
-    return replace(relative, status=Status.OK, covariance_5=own,
+    preferred = tuple(rival for rival in relative.rivals if rival.preference < -_DOUBT)
+    return replace(relative, status=Status.OK, rivals=preferred, covariance_5=own,
                    covariance_6=lifted_covariance(own, relative.t))
 
 

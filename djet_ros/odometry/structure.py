@@ -296,7 +296,7 @@ class TrackScale:
             if agrees is False:
                 return ambiguous(relative)
             return as_pure_rotation(relative, K) if self.lacks_parallax(relative) else relative
-        if agrees and all(self.agrees(rival, relative.x, relative.y) is False
+        if agrees and all(self.agrees(rival.pose, relative.x, relative.y) is False
                           for rival in relative.rivals):
             return replace(relative, status=Status.OK)
         return relative

@@ -343,7 +343,7 @@ class VisualOdometry:
 def _motion_alone(pair: RelativePose | None) -> RelativePose | None:
     """Return a pair without its matches: a motion that may continue."""
     return None if pair is None else RelativePose(
-        Status.OK, pair.R, pair.t, undecided=pair.undecided)
+        Status.OK, pair.R, pair.t, rivals=pair.rivals)
 
 
 def _rotation_at_most(pair: RelativePose, length: Length) -> tuple[Array, Array]:
