@@ -151,6 +151,11 @@ def grainy(i: int, gray: Gray) -> Gray:
                    0, 255).astype(np.uint8)
 
 
+def compressed(i: int, gray: Gray) -> Gray:
+    _, data = cv2.imencode('.jpg', gray, [cv2.IMWRITE_JPEG_QUALITY, 40])
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), np.uint8)
+
+
 def wrong_matches(share: float) -> Iterator[Outcome]:
     """Return the inliers of a pair, with a share of them replaced by matches to anywhere."""
     scene = make_scene('road', size=SIZE)
@@ -184,6 +189,7 @@ KINDS: dict[str, Callable[[], Iterator[Outcome]]] = {
     'every third frame dropped': partial(drive, 'road', keep=lambda i: i % 3 != 1),
     'dim and hazy water, particles': partial(drive, 'underwater'),
     'noise of 12 gray levels': partial(drive, 'indoor', grainy),
+    'JPEG of quality 40': partial(drive, 'indoor', compressed),
     '1 % of the matches wrong': lambda: wrong_matches(0.01),
     '50 % of the matches wrong': lambda: wrong_matches(0.5),
     'half of the image moves by itself': partial(drive, 'moving_object'),
