@@ -284,17 +284,26 @@ def test_no_planar_pair_is_certain_of_the_wrong_twin(seed: int) -> None:
     assert sure >= 2
 
 
-@pytest.mark.parametrize('seed', range(4))
-def test_motion_towards_a_wall_is_not_certain_of_the_wrong_twin(seed: int) -> None:
-    """Both are in one basin, and the prior may lead all starts to the same one."""
+def test_motion_towards_a_wall_is_not_certain_of_the_wrong_twin() -> None:
+    """
+    Both are in one basin, and the prior may lead all starts to the same one.
+
+    A covariance spans the line to its rival, which is itself off by a degree or two: in one or two
+    of a hundred pairs the true motion is far beside that line.
+    """
     t = -0.06 * Rotation.from_euler('y', 10, degrees=True).as_matrix()[:, 2]
-    estimator, prior = TwoViewEstimator(), None
-    views = [estimator.view(gray, CLOSE_UP)
-             for gray in pictures_towards_a_wall(np.random.default_rng([seed, 11]), t, 14)]
-    for pair in pairwise(views):
-        prior = estimator.estimate(*pair, prior)
-        off = pose_difference(prior.R, prior.t, Pose(np.eye(3), unit(t)))
-        assert squared_distance(prior.covariance_5, off) < chi2.ppf(1 - 1e-5, 5)
+    true, beyond = Pose(np.eye(3), unit(t)), []
+    for seed in range(10):
+        estimator, prior = TwoViewEstimator(), None
+        views = [estimator.view(gray, CLOSE_UP) for gray in pictures_towards_a_wall(
+            np.random.default_rng([seed, 11]), t, 14)]
+        for pair in pairwise(views):
+            prior = estimator.estimate(*pair, prior)
+            off = pose_difference(prior.R, prior.t, true)
+            if np.degrees(np.linalg.norm(off[3:])) > 5:
+                assert np.degrees(np.sqrt(np.trace(prior.covariance_5[3:, 3:]))) > 2.5
+            beyond.append(squared_distance(prior.covariance_5, off) > chi2.ppf(1 - 1e-5, 5))
+    assert np.mean(beyond) < 0.03
 
 
 def test_planar_twins_are_mutual() -> None:
