@@ -151,9 +151,9 @@ def corner_slopes(image: Image) -> tuple[NDArray[np.float32], NDArray[np.float32
     # With even sides halving is exact, and OpenCV is five times as fast.
     height, width = (side // 2 for side in image.shape)
     image = image[:2 * height, :2 * width]
-    slopes, steepness = np.empty((2, height, width), np.float32)
     if compiled.library is not None and min(height, width) > 1:
         return compiled.corner_slopes(image, _MIN_RATIO, 0.5 / _SOBEL_GAIN**2)
+    slopes, steepness = np.empty((2, height, width), np.float32)
     for first in range(0, height, _STRIP):
         strip = slice(first, first + _STRIP)
         slopes[strip], steepness[strip] = _slopes_of_rows(image, first,
@@ -163,7 +163,7 @@ def corner_slopes(image: Image) -> tuple[NDArray[np.float32], NDArray[np.float32
 
 def _slopes_of_rows(image: Image, first: int, after: int
                     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the slopes of some rows of blocks; few rows keep temporary images in the cache."""
+    """Return the same for some rows of blocks; few rows keep temporary images in the cache."""
     # Including neighbouring rows, and the rows that the gradients of these need.
     start, end = max(first - 1, 0), min(after + 1, len(image) // 2)
     top = max(2 * start - 1, 0)

@@ -306,9 +306,9 @@ class Window:
             return measured.length, measured
         if measured.share > self._tuning.bounding_sigma:
             return guess, by_guess
-        shorter = measured.fused(by_guess)
-        found = [self._count_found(view, relative, length) for length in (guess, shorter)]
-        return guess if found[0] > found[1] / 2 else shorter, by_guess
+        mean = measured.fused(by_guess)
+        found = [self._count_found(view, relative, length) for length in (guess, mean)]
+        return guess if found[0] > found[1] / 2 else mean, by_guess
 
     def _count_found(self, view: View, relative: RelativePose, length: float) -> int:
         """Count the landmarks that are found in a view after a pair of some length."""
@@ -345,8 +345,9 @@ class Window:
         By the depths around the landmarks of the window before: the scene stays where it was.
         """
         measured = None if self._scene is None else self._measured_around(self._scene, relative)
-        determined = measured is not None and measured.share < self._tuning.guess_sigma
-        return (measured.length, measured.share) if measured and determined else None
+        if measured is None or measured.share >= self._tuning.guess_sigma:
+            return None
+        return measured.length, measured.share
 
     def _measured_around(self, known: KnownDepths, relative: RelativePose) -> _Measured | None:
         """Return the length by points nearby, as the pair may have no match of the known ones."""
