@@ -11,8 +11,10 @@ from types import SimpleNamespace
 from djet_ros.core.basins import likeliest, lowest_nearby_minimum
 from djet_ros.core.covariance import (
     lifted_covariance,
+    pose_covariance,
     pose_difference,
     squared_distance,
+    widened,
     widened_to_span,
 )
 from djet_ros.core.estimator import TwoViewEstimator
@@ -25,7 +27,7 @@ from djet_ros.core.geometry import (
     rotation_exp,
     unit,
 )
-from djet_ros.core.jet import jet_problem, Loss, minimise
+from djet_ros.core.jet import epipolar_residuals, jet_problem, Loss, minimise
 from djet_ros.core.pair import Pair
 from djet_ros.core.rivals import (
     continues_motion,
@@ -534,15 +536,40 @@ def test_an_improbable_distant_rival_does_not_widen_the_covariance(
     seen = two_views(np.random.default_rng(7), count=100)
     around, aside = np.cross(seen.t, (0, 0, 1)), np.radians(60)
     rival = Rival(Pose(seen.R, rotation_exp(aside * unit(around)) @ seen.t), preference)
-    track = SimpleNamespace(rivals=(rival,), nearby=(), body_ambiguous=two_bodies)
     own = np.radians(0.2)**2 * np.eye(5)
-    _, covariance, _ = _compare_with_rivals(Pose(seen.R, seen.t), own, track, seen.x, None,
-                                            sign_open=False)
-    claimed = np.degrees(np.sqrt(np.trace(covariance[3:, 3:])))
-    # The squared distance times its probability; otherwise only the covariance of the pose.
+    covariance, of_rival = compared_with(rival, seen, own, two_bodies)
+    # The squared distance times its probability, and how uncertain the rival itself is; otherwise
+    # only the covariance of the pose.
+    added = covariance - own - spanned * of_rival
     probable = norm.cdf(-preference / 2) if spanned else 0.0
-    assert claimed == pytest.approx(np.hypot(
-        0.2 * np.sqrt(2), np.degrees(np.sqrt(probable) * aside)), rel=0.01)
+    assert np.trace(added[3:, 3:]) == pytest.approx(probable * aside**2, rel=1e-6, abs=1e-12)
+
+
+def compared_with(rival: Rival, seen: TwoViews, own: np.ndarray, two_bodies: bool = False
+                  ) -> tuple[np.ndarray, np.ndarray]:
+    """Return the covariance of the true pose that spans a rival, and that of the rival (5, 5)."""
+    pose, voting = Pose(seen.R, seen.t), np.ones(len(seen.x), bool)
+    problem = jet_problem(K, seen.x, ReprojectionSurface(seen.x, seen.y).fit_around(seen.y))
+    track = SimpleNamespace(rivals=(rival,), nearby=(), body_ambiguous=two_bodies,
+                            problem=problem, loss=Loss(), voting=voting)
+    _, covariance, _ = _compare_with_rivals(pose, own, track, seen.x, None, sign_open=False)
+    residuals = epipolar_residuals(problem, rival.pose.R, rival.pose.t)
+    of_rival = pose_covariance(residuals, Loss(), seen.x, seen.t, flipped=False)[1]
+    return covariance, widened(np.zeros((5, 5)), seen.t, of_rival)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_beside_the_line_to_a_possible_rival_a_pose_is_as_uncertain_as_that(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    seen = two_views(rng, count=100)
+    rival = Rival(Pose(*moved_pose(seen.R, seen.t, 0.1, rng)), rng.uniform(0.5, 4.5))
+    off = pose_difference(seen.R, seen.t, rival.pose)
+    covariance, of_rival = compared_with(rival, seen, 1e-12 * np.eye(5))
+    # Errors of a true rival, sampled: all but their part along the line are within the bound.
+    errors = off + rng.multivariate_normal(np.zeros(5), of_rival, 1000)
+    probability = norm.cdf(-rival.preference / 2)
+    squared = np.array([squared_distance(covariance, error) for error in errors])
+    assert (squared < 1 / probability + chi2.ppf(0.999, 5)).mean() > 0.99
 
 
 def test_only_a_motion_like_the_previous_one_continues_it() -> None:

@@ -236,9 +236,10 @@ def _compare_with_rivals(pose: Pose, covariance: Array, track: Track, x: Array,
     motion with the probability that the preference is due to noise. If that is negligible, the
     rival is ignored, unless two bodies move: with a motion 60 degrees away, a probability of six
     in a thousand turns a standard deviation of a fifth of a degree into one of five degrees.
+    Should a possible rival be true, errors beside the line that spans it are as large as its own
+    covariance says, so that is added.
     """
     status = Status.TWO_MOTIONS if track.body_ambiguous else Status.OK
-    undecided_covariances: list[Array] = []
     possible: list[Rival] = []
     for rival in (*track.rivals, *track.nearby):
         offset = pose_difference(pose.R, pose.t, rival.pose)
@@ -252,12 +253,10 @@ def _compare_with_rivals(pose: Pose, covariance: Array, track: Track, x: Array,
             probability = float(ndtr(-rival.preference / _OVERSTATEMENT))
             covariance = widened_to_span(covariance, offset, probability)
             possible.append(rival)
-        if undecided:
-            undecided_covariances.append(_covariance_of(rival.pose, track, x))
     # Only after all rivals were compared: the uncertainty of one rival must not make another one
     # look covered.
-    for other in undecided_covariances:
-        covariance = widened(covariance, pose.t, other)
+    for rival in possible:
+        covariance = widened(covariance, pose.t, _covariance_of(rival.pose, track, x))
     if sign_open:
         status = status if track.body_ambiguous else Status.AMBIGUOUS
         # The arc to -t is pi, in no particular tangent direction.
