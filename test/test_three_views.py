@@ -1,13 +1,12 @@
-"""The pair before decides what a pair alone leaves open: between motions, and between bodies."""
+"""The pair before decides which of the motions that a pair alone leaves open is the true one."""
 
 from itertools import pairwise
 
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.geometry import direction_angle, rotation_angle, unit
-from djet_ros.core.three_views import consistent_motion, of_followed_body
+from djet_ros.core.three_views import consistent_motion
 from djet_ros.core.types import Pose, RelativePose, Rival, Status
-from djet_ros.lab.scenes.catalogue import make_scene
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.visual_odometry import VisualOdometry
 import numpy as np
@@ -151,76 +150,3 @@ def test_over_flat_ground_pairs_after_the_first_ones_have_the_true_motion():
             assert np.degrees(direction_angle(result.motion[:3, 3], true_motion[:3, 3])) < 2
     assert alone.count(Status.AMBIGUOUS) > len(alone) / 3
     assert set(in_a_row) == {Status.OK}
-
-
-def pair_with_a_lorry(rng: np.random.Generator, voting: np.ndarray) -> RelativePose:
-    """
-    Return a pair with 800 matches, the first 500 of which, in the left half, fit its motion.
-
-    One of five does not fit there, and one of five of the lorry's, in the right half, does.
-    """
-    y = rng.uniform((0, 0), np.array(SIZE) * (0.5, 1), (800, 2))
-    y[500:, 0] += SIZE[0] / 2
-    fits = (np.arange(800) < 500) ^ (np.arange(800) % 5 == 0)
-    return RelativePose(
-        Status.OK, x=np.add(y, (60, 0)), y=y, inliers=fits & voting, voting=voting,
-        residuals=np.where(fits, rng.normal(0, NOISE, 800), rng.choice([-2, 2], 800)))
-
-
-def places_in_each_half(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return places more than 30 pixels from the border between the halves."""
-    x = rng.uniform((0, 0), SIZE, (1000, 2))
-    x = x[np.abs(x[:, 0] - SIZE[0] / 2) > 30]
-    return x, x[:, 0] < SIZE[0] / 2
-
-
-@pytest.mark.parametrize('seed', range(10))
-def test_places_of_another_body_are_found_among_matches_that_fit_by_chance(seed: int):
-    rng = np.random.default_rng(seed)
-    x, left = places_in_each_half(rng)
-    followed = of_followed_body(pair_with_a_lorry(rng, np.ones(800, bool)), x)
-    # Of seven neighbours four or more are of the wrong kind with a probability of 0.033.
-    assert followed[left].mean() > 0.9
-    assert followed[~left].mean() < 0.1
-
-
-def test_places_that_were_left_out_come_back_once_they_fit_closely():
-    rng = np.random.default_rng(0)
-    x, left = places_in_each_half(rng)
-    # The lorry is gone, and what it hid fits, but did not vote.
-    pair = pair_with_a_lorry(rng, np.arange(800) < 500)
-    pair.residuals[500:] = rng.normal(0, NOISE, 300)
-    assert of_followed_body(pair, x)[~left].mean() > 0.7
-    pair.residuals[500:] = rng.normal(0, 5 * NOISE, 300)
-    assert of_followed_body(pair, x)[~left].mean() < 0.05
-
-
-def test_a_pair_without_inliers_follows_no_body_more_than_another():
-    pair = pair_with_a_lorry(np.random.default_rng(0), np.zeros(800, bool))
-    assert of_followed_body(pair, pair.y).all()
-
-
-@pytest.mark.parametrize('count', [1, 5])
-def test_a_few_matches_tell_of_a_body_too(count: int):
-    y = np.random.default_rng(0).uniform((0, 0), SIZE, (count, 2))
-    pair = RelativePose(Status.OK, x=y, y=y, inliers=np.ones(count, bool),
-                        voting=np.ones(count, bool), residuals=np.full(count, NOISE))
-    assert of_followed_body(pair, y[:1] + np.arange(20).reshape(10, 2)).all()
-
-
-@pytest.mark.slow
-def test_while_a_lorry_is_overtaken_the_camera_keeps_its_own_motion():
-    """The lorry moves along the same road, and has up to two thirds of the matches."""
-    scene, estimator = make_scene('motorway', seed=1), TwoViewEstimator()
-    poses, before, prior = scene.trajectory(32), None, None
-    for index in range(24, 32):
-        view = estimator.view(scene.render(poses[index], index), scene.K)
-        if before is not None:
-            prior = estimator.estimate(before, view, prior)
-            truth = np.linalg.inv(poses[index]) @ poses[index - 1]
-            assert prior.status is Status.OK
-            assert np.degrees(rotation_angle(prior.R, truth[:3, :3])) < 0.02
-            assert np.degrees(direction_angle(prior.t, truth[:3, 3])) < 0.4
-        before = view
-    # Matches on the lorry are kept, as outliers.
-    assert prior is not None and prior.inliers.sum() < 0.4 * len(prior.x)

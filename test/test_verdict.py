@@ -121,6 +121,8 @@ def test_matches_that_were_left_out_are_outliers_in_their_places() -> None:
         np.testing.assert_array_equal(getattr(whole, name)[kept], getattr(part, name))
     assert part.inliers.sum() > 100 and not (whole.inliers | whole.voting)[~kept].any()
     np.testing.assert_array_equal(whole.y_opt[~kept], y[~kept])
+    np.testing.assert_array_equal(whole.of_body, kept)
+    assert part.of_body.all() and len(part.of_body) == kept.sum()
     lines = epipolar_lines(fundamental(K, seen.R, seen.t), seen.x)
     np.testing.assert_allclose(whole.residuals, line_distances(lines, y), atol=0.5)
     assert np.median(np.abs(whole.residuals[~kept])) > 3

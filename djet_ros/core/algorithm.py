@@ -104,7 +104,8 @@ class Track:
 
     Set by ``core.tracking``: body_ambiguous: whether two bodies move and nothing decides which of
     them is the static world (the other motion is the rival); attached: (N,) bool, matches on what
-    moves with the camera, which the pose still includes, None if there are none.
+    moves with the camera, which the pose still includes, None if there are none; left_out: (N,)
+    bool, matches of another body, which the pose does not include, None if there are none.
     """
 
     pose: Pose
@@ -123,6 +124,7 @@ class Track:
     nearby: tuple[Rival, ...] = ()
     body_ambiguous: bool = False
     attached: NDArray[np.bool_] | None = None
+    left_out: NDArray[np.bool_] | None = None
 
     @property
     def iterations(self) -> int:

@@ -9,6 +9,12 @@ from time import perf_counter
 
 from djet_ros.core.algorithm import evaluate_at, Track
 from djet_ros.core.basins import BASIN_TUNING
+from djet_ros.core.bodies import (
+    CONTINUING,
+    fits_followed_body,
+    of_followed_body,
+    readmitted,
+)
 from djet_ros.core.corners import detect_corners, detect_large_corners
 from djet_ros.core.covariance import is_within, pose_difference
 from djet_ros.core.estimator_config import EstimatorConfig
@@ -22,7 +28,12 @@ from djet_ros.core.memory import keep_freed_memory
 from djet_ros.core.pair import Limits, Observer, Pair
 from djet_ros.core.parallel import run_both
 from djet_ros.core.radial import undistort_image
-from djet_ros.core.rivals import MIN_BODY_SHARE, PreviousMotion
+from djet_ros.core.rivals import (
+    continues_motion,
+    MIN_BODY_SHARE,
+    pose_distance,
+    PreviousMotion,
+)
 from djet_ros.core.starts import (
     external_starts,
     five_point,
@@ -37,7 +48,6 @@ from djet_ros.core.surfaces import (
     ReprojectionSurface,
     ResidualSurface,
 )
-from djet_ros.core.three_views import of_followed_body
 from djet_ros.core.tracking import track_jointly
 from djet_ros.core.types import (
     Array,
@@ -128,41 +138,56 @@ class TwoViewEstimator:
         if predicted is not None and prior is not None:
             (x, y), bits, motion = predicted
             limits = _limits_from(prior)
-            result = self.estimate_pair(Pair(
+            result = self._estimate_followed(Pair(
                 previous, current, x, y, _previous_motion(prior), known, motion, limits, bits,
-                sought=len(previous.features), timings=timings))
+                sought=len(previous.features), timings=timings), prior)
             if _within_limits(result, limits):
                 return result
 
         # Otherwise match in the whole search radius.
         with _timed(timings, 'matching'):
             x, y = match_widely(previous, current, prior, known, self.config.search_radius)
-        pair = Pair(previous, current, x, y, _previous_motion(prior), known,
-                    sought=len(previous.features.with_additional), timings=timings)
+        return self._estimate_followed(Pair(
+            previous, current, x, y, _previous_motion(prior), known,
+            sought=len(previous.features.with_additional), timings=timings), prior)
+
+    def _estimate_followed(self, pair: Pair, prior: RelativePose | None) -> RelativePose:
+        """
+        Estimate the motion of the body that the previous pair followed.
+
+        If another body moved there, its matches are left out: by now they may be the majority, or
+        fit a compromise of both motions. But all are used if no other body moves any more, or if
+        they go on by the previous motion, or by one that the previous pair left open.
+        """
+        followed = np.ones(len(pair.x), bool) if prior is None else of_followed_body(prior, pair.x)
+        if prior is None or (~followed).sum() <= MIN_BODY_SHARE * len(followed):
+            return self.estimate_pair(pair)
+        alone = self._estimate_alone(pair, prior, followed)
+        if alone is not None and _is_steady(alone, pair.prior) and not fits_followed_body(alone):
+            return alone
         result = self.estimate_pair(pair)
-        # If another body moved in the previous pair, go on with the one that it followed: by now
-        # most matches may be of the other one, or fit a compromise.
-        followed = None if prior is None else self._estimate_followed(pair, prior)
-        if followed is None or _is_same(followed, result):
+        if alone is None or _is_same(alone, result):
             return result
-        # Unless all matches go on by a motion that the previous pair left open.
-        is_open = pair.prior is not None and pair.prior.leaves_open(_pose(followed), _pose(result))
-        return result if is_open else followed
+        before, one, other = pair.prior, _pose(alone), _pose(result)
+        goes_on = before is not None and (
+            continues_motion(before, other, one) or before.leaves_open(one, other))
+        return result if goes_on else alone
 
-    def _estimate_followed(self, pair: Pair, prior: RelativePose) -> RelativePose | None:
+    def _estimate_alone(self, pair: Pair, prior: RelativePose, followed: NDArray[np.bool_]
+                        ) -> RelativePose | None:
         """
-        Estimate the motion of the body that the previous pair followed, from its matches alone.
+        Estimate the motion of some of the matches (N,) alone.
 
-        None if there are hardly any others, or if they do not fit one motion as before: also if
-        that is a rotation alone, or if some of them turn out to be attached to the camera.
+        None if they do not fit one motion as before: also if that is a rotation alone, or if some
+        of them turn out to be attached to the camera.
         """
-        followed = of_followed_body(prior, pair.x)
-        if (~followed).sum() <= MIN_BODY_SHARE * len(followed):
-            return None
-        result = self.estimate_pair(pair.without(~followed))
+        result = self.estimate_pair(pair.of(followed))
         found = (result.t.any() and len(result.x) == followed.sum()
                  and _within_limits(result, _limits_from(prior)))
-        return with_left_out(result, pair, followed) if found else None
+        if not found:
+            return None
+        whole = with_left_out(result, pair, followed)
+        return replace(whole, left_out=~whole.of_body & ~readmitted(whole, pair.current.K))
 
     def match(self, previous: View, current: View) -> Matches:
         """Match the features of two views: pixels x and y (N, 2), the most reliable first."""
@@ -319,15 +344,21 @@ def _limits_from(prior: RelativePose) -> Limits:
 
     Most matches have to agree: with another moving body, the prior may be a compromise already.
     """
-    noise = max(robust_scale(prior.residuals), _MIN_NOISE)
+    noise = max(robust_scale(prior.residuals[prior.of_body]), _MIN_NOISE)
     return Limits(_MAX_NOISE_GROWTH * noise, MIN_RIGID_SHARE)
 
 
 def _within_limits(result: RelativePose, limits: Limits) -> bool:
     """Return whether a pair has a reliable status and is within limits."""
     return (result.status in (Status.OK, Status.NO_PARALLAX)
-            and robust_scale(result.residuals) < limits.max_noise
-            and result.inliers.mean() > limits.min_agreeing)
+            and robust_scale(result.residuals[result.of_body]) < limits.max_noise
+            and result.inliers[result.of_body].mean() > limits.min_agreeing)
+
+
+def _is_steady(relative: RelativePose, prior: PreviousMotion | None) -> bool:
+    """Return whether a motion goes on as the previous one, of which its pair was sure."""
+    return (prior is not None and not prior.undecided
+            and pose_distance(prior, _pose(relative)) < CONTINUING)
 
 
 def _is_same(one: RelativePose, other: RelativePose) -> bool:

@@ -76,7 +76,8 @@ def match_predicted(previous: View, current: View, prior: RelativePose | None, k
     choice of motions. search_radius: as a share of the longer image side.
     """
     if (prior is None or known.rotation is not None or search_radius >= 1
-            or prior.inliers.sum() < _MIN_MATCHES or prior.inliers.mean() < MIN_RIGID_SHARE):
+            or prior.inliers.sum() < _MIN_MATCHES
+            or prior.inliers[prior.of_body].mean() < MIN_RIGID_SHARE):
         return None
     reach = min(flow_reach(NEAR_LEVELS), search_radius * max(current.gray.shape))
     motion = (PreviousMotion.of(prior) if known.guess is None

@@ -78,11 +78,15 @@ class Pair:
     observe: Observer | None = None
     timings: dict[str, float] = field(default_factory=dict)
 
+    def of(self, chosen: NDArray[np.bool_]) -> Pair:
+        """Return the pair with some (N,) of its matches, and the others as outliers."""
+        def of_chosen(values: Array | None) -> Array | None:
+            return None if values is None else values[chosen]
+
+        return replace(self, x=self.x[chosen], y=self.y[chosen], bits=of_chosen(self.bits),
+                       covariances=of_chosen(self.covariances),
+                       outliers=self.outliers + int((~chosen).sum()))
+
     def without(self, removed: NDArray[np.bool_]) -> Pair:
         """Return the pair without some (N,) of its matches, as outliers, and not predicted."""
-        def rest(values: Array | None) -> Array | None:
-            return None if values is None else values[~removed]
-
-        return replace(self, x=self.x[~removed], y=self.y[~removed], bits=rest(self.bits),
-                       covariances=rest(self.covariances), predicted=None,
-                       outliers=self.outliers + int(removed.sum()))
+        return replace(self.of(~removed), predicted=None)

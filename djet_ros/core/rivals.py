@@ -238,7 +238,7 @@ def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
     least = max(least, round(MIN_BODY_SHARE * (distances < _INLIER * scale).sum()))
     if len(outliers) < least:
         return None
-    pose = _fit_motion(problem.subset(outliers), first, scale)
+    pose = fit_motion(problem.subset(outliers), first, scale)
     members = _distances(problem, refine_all(problem, [pose], Loss(), 0)) < _INLIER * scale
     agreeing = members[outliers].sum()
     if agreeing < least or agreeing <= len(outliers) / 2:
@@ -251,7 +251,7 @@ def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
                          _flatness(problem.subset(only_second), pose)))
 
 
-def _fit_motion(problem: JetProblem, near: Pose, scale: float) -> Pose:
+def fit_motion(problem: JetProblem, near: Pose, scale: float) -> Pose:
     """Fit the motion with most inliers among some matches, from starts around another motion."""
     rough, tight = (Loss('geman_mcclure', share * scale) for share in (_OUTLIER, _INLIER))
     subset = problem.subset(subsampled(len(problem.blur), _MAX_OUTLIERS))
@@ -281,7 +281,7 @@ def motion_without_attached(problem: JetProblem, fixed: NDArray[np.bool_], pose:
     if min(fixed.sum(), (~fixed).sum()) < least:
         return None
     moving = problem.subset(~fixed)
-    motion = _fit_motion(moving, pose, scale)
+    motion = fit_motion(moving, pose, scale)
     # Matches that stay in place are less noisy than those that move.
     scale = max(clipped_scale(refine_all(moving, [motion], Loss(), 0).r[0]), scale)
     tight = refine_all(moving, [motion], Loss('geman_mcclure', _INLIER * scale), _STEPS)

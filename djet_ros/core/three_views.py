@@ -1,5 +1,5 @@
 """
-What the pair before tells of a pair: which of several motions, and which of several bodies.
+What the pair before tells of a pair: which of several motions is the true one.
 
 Two views of a plane fit two motions (see `core.rivals.planar_twin`), and no match tells which is
 true. The two give the points different depths, and the next pair triangulates the same points
@@ -18,7 +18,6 @@ from djet_ros.core.rivals import preferences, SIGNIFICANT_PREFERENCE
 from djet_ros.core.types import Array, Pose, RelativePose
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 # chosen: fewer shared points do not decide.
 _MIN_POINTS = 30
@@ -30,13 +29,6 @@ _MAX_NOISE = 1.5
 
 # Robust standard deviations beyond which a point is an outlier.
 _OUTLIER = 4.0
-
-# Robust standard deviations within which a match of a pair fits its motion, if it voted; chosen:
-# and if it was left out as of another body, whose matches fit by chance.
-_INLIER, _READMITTED = 3.0, 1.0
-
-# chosen: number of matches around a place that tell of which body it is.
-_NEIGHBOURS = 7
 
 
 def consistent_motion(before: RelativePose, current: RelativePose, K: Array) -> Pose | None:
@@ -102,20 +94,3 @@ def _disagreement(known: tuple[Array, Array], triangulated: tuple[Array, Array])
     (known_rho, known_sigma), (rho, sigma) = known, triangulated
     ratio = weighted_median(rho / known_rho, np.abs(known_rho) / sigma)
     return np.asarray((rho - ratio * known_rho) / np.hypot(sigma, ratio * known_sigma))
-
-
-def of_followed_body(before: RelativePose, x: Array) -> NDArray[np.bool_]:
-    """
-    Return which places x (N, 2) in the second image of a pair are of the body whose motion it has.
-
-    There most of the nearest matches of that pair fit its motion. A single one tells little: of a
-    body that moves in the same direction, as a lorry that is overtaken, the epipolar lines are
-    nearly the same. All, if the pair has no inliers.
-    """
-    if not before.inliers.any():
-        return np.ones(len(x), bool)
-    noise = robust_scale(before.residuals[before.inliers])
-    fits = np.abs(before.residuals) < noise * np.where(before.voting, _INLIER, _READMITTED)
-    count = min(_NEIGHBOURS, len(fits))
-    nearest = cKDTree(before.y).query(x, count)[1].reshape(len(x), count)
-    return np.asarray(fits[nearest].mean(1) > 0.5)

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 from djet_ros.core.algorithm import Algorithm, ALGORITHM_TUNING, Track
 from djet_ros.core.basins import BASIN_TUNING, better_by_parts, likeliest
+from djet_ros.core.bodies import continuing_motion
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.fusion import MeasuredRotation
 from djet_ros.core.geometry import norms
@@ -207,6 +208,9 @@ def _camera_of_two_motions(algorithm: Algorithm, track: Track, noise: float) -> 
     If nothing decides, the more spread-out one is taken, as the static world surrounds what moves
     in it, and the other one is the rival.
     """
+    continuing = _continuing_track(algorithm, track, noise)
+    if continuing is not None:
+        return continuing
     pair, first = algorithm.pair, algorithm.first
     second = second_motion(first.problem, first.x, track.pose, noise,
                            algorithm.config.min_matches)
@@ -222,6 +226,19 @@ def _camera_of_two_motions(algorithm: Algorithm, track: Track, noise: float) -> 
         other = second.motions[1 - camera]
         return replace(track, rivals=(Rival(other, 0.0),), body_ambiguous=True)
     return track
+
+
+def _continuing_track(algorithm: Algorithm, track: Track, noise: float) -> Track | None:
+    """Return the track of the body followed so far, if another one has displaced it."""
+    pair, first = algorithm.pair, algorithm.first
+    found = None if pair.prior is None else continuing_motion(
+        first.problem, first.x, pair.prior, track.pose, noise)
+    if found is None:
+        return None
+    left_out = np.zeros(len(pair.y), bool)
+    left_out[first.voting] = found.other
+    alone = algorithm.rerun(found.pose, alive=~left_out)
+    return None if alone is None else replace(alone, left_out=left_out)
 
 
 def _decide_camera(second: SecondMotion, prior: Pose | None,

@@ -181,7 +181,8 @@ class RelativePose:
     motions, up to the sign of t and beyond own_covariance_5, that the matches do not exclude
     beyond doubt, and the pose with -t if they do not exclude that;
     own_covariance_5: (5, 5) covariance_5 as it is without any rival; sought: number of features of
-    the previous image that were searched, 0 if matches were given.
+    the previous image that were searched, 0 if matches were given; left_out: (N,) bool, matches of
+    another body, which did not take part, None if there are none.
     """
 
     status: Status
@@ -206,3 +207,9 @@ class RelativePose:
     rivals: tuple[Rival, ...] = ()
     own_covariance_5: Array = field(default_factory=lambda: np.full((5, 5), np.nan))
     sought: int = 0
+    left_out: NDArray[np.bool_] | None = None
+
+    @property
+    def of_body(self) -> NDArray[np.bool_]:
+        """Return the (N,) bool mask of the matches of the body that was followed: all, or most."""
+        return np.ones(len(self.inliers), bool) if self.left_out is None else ~self.left_out

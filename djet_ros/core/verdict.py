@@ -118,7 +118,7 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
         hamming=hamming, losses=track.losses, culled=int((~track.voting).sum()),
         indefinite=track.indefinite, iterations=track.iterations, timings=pair.timings,
         sought=pair.sought, rivals=tuple(rivals),
-        own_covariance_5=own_covariance)
+        own_covariance_5=own_covariance, left_out=track.left_out)
 
 
 def as_decided(relative: RelativePose) -> RelativePose:
@@ -150,6 +150,7 @@ def with_left_out(relative: RelativePose, pair: Pair, kept: NDArray[np.bool_]) -
     lines = epipolar_lines(fundamental(pair.current.K, relative.R, relative.t), pair.x)
     return replace(
         relative, x=pair.x, y=pair.y, y_opt=all_of(relative.y_opt, pair.y),
+        left_out=all_of(~relative.of_body, ~none),
         inliers=all_of(relative.inliers, none), voting=all_of(relative.voting, none),
         placed=all_of(relative.placed, unplaced.places),
         placed_covariances=all_of(relative.placed_covariances, unplaced.covariances),

@@ -1,0 +1,192 @@
+"""
+Several bodies that move: following one of them from pair to pair.
+
+Of a pair alone, the body with most matches is the likeliest to be the static world. But a lorry
+that is overtaken may come to have most matches, and as long as it moves in about the same
+direction, one pose fits both nearly. So its matches are left out from when they first contradict
+the motion of the others, until most of them no longer do.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from djet_ros.core.jet import epipolar_residuals, jet_problem, JetProblem, Loss, robust_scale
+from djet_ros.core.rivals import (
+    continues_motion,
+    fit_motion,
+    MIN_BODY_SHARE,
+    pose_distance,
+)
+from djet_ros.core.sketch import refine_all
+from djet_ros.core.surfaces import ReprojectionSurface
+from djet_ros.core.types import Array, Pose, RelativePose
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.special import bdtrc
+
+# Robust standard deviations within which a match fits a motion, and beyond which it contradicts
+# it.
+_FITTING, _CONTRADICTING = 3.0, 6.0
+
+# chosen: the same for a match that was left out as of another body; and by how much a fitting one
+# counts against one that contradicts. A body that moves in about the same direction fits by chance
+# in much of its area.
+_FITTING_LEFT_OUT, _BY_CHANCE = 1.0, 1 / 3
+
+# chosen: number of matches around a place that tell of which body it is; of a body, more than a
+# row where its epipolar lines agree by chance.
+_NEIGHBOURS = 15
+
+# chosen: share of those around a place that follow another motion only, of which it is then part.
+_SHARE = 0.75
+
+# Significance of the sign test: one false alarm in hours of video. Fewer matches cannot reach it.
+_SIGNIFICANCE = 1e-5
+_FEWEST = int(np.ceil(-np.log2(_SIGNIFICANCE)))
+
+# rad; chosen: a motion as close to the previous one continues it, whatever else moves; and how far
+# a continuing one may be: twice as much, and false matches seemed to continue a motion.
+_STEADY, CONTINUING = 0.01, 0.05
+
+# chosen: steps of the optimiser, and how often the other body is determined anew.
+_STEPS, _REPETITIONS = 6, 2
+
+
+def of_followed_body(before: RelativePose, x: Array) -> NDArray[np.bool_]:
+    """
+    Return which places x (N, 2) in the second image of a pair are of the body whose motion it has.
+
+    There the nearest matches of that pair fit its motion rather than contradict it. A single one
+    tells little: of a body that moves in the same direction, as a lorry that is overtaken, the
+    epipolar lines are nearly the same. All, if no body contradicts.
+    """
+    if not before.inliers.any():
+        return np.ones(len(x), bool)
+    evidence = _evidence(before)
+    if (evidence < 0).sum() <= MIN_BODY_SHARE * len(evidence):
+        return np.ones(len(x), bool)
+    return np.asarray(evidence[_nearest(before.y, x)].sum(1) >= 0)
+
+
+def _evidence(pair: RelativePose) -> Array:
+    """Return the evidence (N,) of matches that they are of the body whose motion a pair has."""
+    errors = _errors(pair)
+    contradicting = np.where(errors > _CONTRADICTING, -1.0, 0.0)
+    evidence = np.where(errors < _FITTING, 1.0, contradicting)
+    if pair.left_out is not None:
+        by_chance = np.where(errors < _FITTING_LEFT_OUT, _BY_CHANCE, -1.0)
+        evidence[pair.left_out] = by_chance[pair.left_out]
+    return evidence
+
+
+def _errors(pair: RelativePose) -> Array:
+    """Return the distances (N,) of matches from their lines, in robust standard deviations."""
+    return np.abs(pair.residuals) / robust_scale(pair.residuals[pair.inliers])
+
+
+def _nearest(places: Array, x: Array) -> NDArray[np.int64]:
+    """Return the indices (N, k) of the places (M, 2) that are nearest to each of x (N, 2)."""
+    count = min(_NEIGHBOURS, len(places))
+    return np.asarray(cKDTree(places).query(x, count)[1]).reshape(len(x), count)
+
+
+def fits_followed_body(pair: RelativePose) -> bool:
+    """Return whether most of the matches that a pair left out fit its motion."""
+    fitting = _errors(pair)[~pair.of_body] < _FITTING
+    return bool(2 * fitting.sum() > len(fitting))
+
+
+def readmitted(pair: RelativePose, K: Array) -> NDArray[np.bool_]:
+    """
+    Return which matches (N,) a pair left out that are not of another body after all.
+
+    They fit the motion of the pair, and not that of the other body. K: (3, 3).
+    """
+    chosen = ~pair.of_body
+    if chosen.sum() < _FEWEST:
+        return chosen
+    x, y = pair.x[chosen], pair.y[chosen]
+    problem = jet_problem(K, x, ReprojectionSurface(x, y).fit_around(y))
+    noise = robust_scale(pair.residuals[pair.inliers])
+    other = fit_motion(problem, Pose(pair.R, pair.t), noise)
+    of_other = np.abs(epipolar_residuals(problem, other.R, other.t).r) < _FITTING * noise
+    chosen[chosen] = (_errors(pair)[chosen] < _FITTING) & ~of_other
+    return chosen
+
+
+class Continuing(NamedTuple):
+    """A motion that continues the previous one, and the (N,) bool mask of the other body."""
+
+    pose: Pose
+    other: NDArray[np.bool_]
+
+
+def continuing_motion(problem: JetProblem, places: Array, prior: Pose, pose: Pose, noise: float
+                      ) -> Continuing | None:
+    """
+    Return the motion that continues the previous one, if a pose is that of another body.
+
+    While a lorry is overtaken, its matches become the majority, and the pose that fits them may
+    still fit most of the others. The rest are outliers, many of which agree with a motion near the
+    previous one. By chance, as many would if they were on the other side of their epipolar lines;
+    the sign test compares the two. None if it does not decide, or if the pose continues the
+    previous motion, prior, as well. places: (N, 2) pixels; noise: robust standard deviation of the
+    inliers' residuals.
+    """
+    pose = _aligned(pose, prior)
+    if pose_distance(prior, pose) < _STEADY:
+        return None
+    errors = _residuals(problem, pose) / noise
+    outliers = np.abs(errors) > _CONTRADICTING
+    if outliers.sum() < _FEWEST:
+        return None
+    found = fit_motion(problem.subset(np.flatnonzero(outliers)), prior, noise)
+    tight = Loss('geman_mcclure', _FITTING * noise)
+    for _ in range(_REPETITIONS):
+        other = _of_other(places, _residuals(problem, found) / noise, errors)
+        if (~other).sum() < _FEWEST:
+            return None
+        rest = problem.subset(np.flatnonzero(~other))
+        found = refine_all(rest, [found], tight, _STEPS).pose(0)
+    found = _aligned(found, prior)
+    own = _residuals(problem, found) / noise
+    if (pose_distance(prior, found) > CONTINUING or not continues_motion(prior, found, pose)
+            or not _is_significant(own[outliers], errors[outliers])):
+        return None
+    return Continuing(found, _of_other(places, own, errors))
+
+
+def _aligned(pose: Pose, prior: Pose) -> Pose:
+    """Return a pose with the sign of t that is nearer to the prior's."""
+    return Pose(pose.R, pose.t if pose.t @ prior.t >= 0 else -pose.t)
+
+
+def _residuals(problem: JetProblem, pose: Pose) -> Array:
+    return epipolar_residuals(problem, pose.R, pose.t).r
+
+
+def _of_other(places: Array, own: Array, other: Array) -> NDArray[np.bool_]:
+    """
+    Return which matches (N,) fit another motion only, or are where most do.
+
+    places: (N, 2); own, other: (N,) residuals to both motions, in standard deviations.
+    """
+    fits_own, fits_other = np.abs(own) < _FITTING, np.abs(other) < _FITTING
+    known, only_other = np.flatnonzero(fits_own | fits_other), fits_other & ~fits_own
+    if not len(known):
+        return only_other
+    around = only_other[known[_nearest(places[known], places)]].mean(1)
+    return np.asarray(only_other | (around > _SHARE))
+
+
+def _is_significant(own: Array, other: Array) -> bool:
+    """
+    Return whether outliers of one motion agree with another by more than chance.
+
+    own, other: (M,) their residuals to both, in standard deviations. Mirrored at the line of the
+    other motion, a match has the residual own - 2 other.
+    """
+    agreeing, mirrored = (int((np.abs(each) < _FITTING).sum()) for each in (own, own - 2 * other))
+    return bool(agreeing and bdtrc(agreeing - 1, agreeing + mirrored, 0.5) < _SIGNIFICANCE)

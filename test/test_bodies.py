@@ -1,0 +1,228 @@
+"""Several bodies that move: the one that was followed is followed on, whatever the majority."""
+
+from djet_ros.core.bodies import (
+    continuing_motion,
+    fits_followed_body,
+    of_followed_body,
+    readmitted,
+)
+from djet_ros.core.estimator import TwoViewEstimator
+from djet_ros.core.geometry import (
+    direction_angle,
+    epipolar_lines,
+    fundamental,
+    line_distances,
+    rotation_angle,
+    rotation_exp,
+    unit,
+)
+from djet_ros.core.jet import jet_problem, JetProblem, Loss
+from djet_ros.core.rivals import pose_distance
+from djet_ros.core.sketch import refine_all
+from djet_ros.core.surfaces import ReprojectionSurface
+from djet_ros.core.types import Pose, RelativePose, Status
+from djet_ros.lab.scenes.catalogue import make_scene
+import numpy as np
+import pytest
+from two_view import K, project, SIZE
+
+NOISE = 0.1
+# Matches of the static world, of the lorry, and false ones.
+STATIC, LORRY, FALSE = 400, 600, 60
+AHEAD = unit(np.array([0.03, 0.0, 1.0]))
+
+
+def pair_with_a_lorry(rng: np.random.Generator, left_out: np.ndarray | None = None
+                      ) -> RelativePose:
+    """
+    Return a pair with 800 matches, the first 500 of which, in the left half, fit its motion.
+
+    One of five does not fit there, and one of five of the lorry's, in the right half, does.
+    """
+    y = rng.uniform((0, 0), np.array(SIZE) * (0.5, 1), (800, 2))
+    y[500:, 0] += SIZE[0] / 2
+    fits = (np.arange(800) < 500) ^ (np.arange(800) % 5 == 0)
+    return RelativePose(
+        Status.OK, x=np.add(y, (60, 0)), y=y, inliers=fits, voting=np.ones(800, bool),
+        residuals=np.where(fits, rng.normal(0, NOISE, 800), rng.choice([-2, 2], 800)),
+        left_out=left_out)
+
+
+def places_in_each_half(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return places more than 30 pixels from the border between the halves."""
+    x = rng.uniform((0, 0), SIZE, (1000, 2))
+    x = x[np.abs(x[:, 0] - SIZE[0] / 2) > 30]
+    return x, x[:, 0] < SIZE[0] / 2
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_places_of_another_body_are_found_among_matches_that_fit_by_chance(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    x, left = places_in_each_half(rng)
+    followed = of_followed_body(pair_with_a_lorry(rng), x)
+    # Of fifteen neighbours eight or more are of the wrong kind with a probability of 0.004.
+    assert followed[left].mean() > 0.97
+    assert followed[~left].mean() < 0.03
+
+
+def test_places_that_were_left_out_come_back_once_most_fit_closely() -> None:
+    rng = np.random.default_rng(0)
+    x, left = places_in_each_half(rng)
+    # The lorry is gone, and what it hid fits. Of normal errors, two thirds are within one
+    # standard deviation, and of three that are, one that is not is as much evidence.
+    pair = pair_with_a_lorry(rng, np.arange(800) >= 500)
+    pair.residuals[500:] = rng.normal(0, NOISE / 2, 300)
+    assert of_followed_body(pair, x)[~left].mean() > 0.8
+    pair.residuals[500:] = rng.normal(0, 2 * NOISE, 300)
+    assert of_followed_body(pair, x)[~left].mean() < 0.01
+    # If they were not left out before, the same errors are no evidence of another body.
+    assert of_followed_body(pair_with_residuals(pair), x)[~left].all()
+
+
+def pair_with_residuals(pair: RelativePose) -> RelativePose:
+    """Return a pair with the same errors that left out none of its matches."""
+    return RelativePose(Status.OK, x=pair.x, y=pair.y, inliers=pair.inliers, voting=pair.voting,
+                        residuals=pair.residuals)
+
+
+def test_scattered_outliers_are_no_body() -> None:
+    rng = np.random.default_rng(0)
+    pair = pair_with_a_lorry(rng)
+    pair.residuals[:] = np.where(np.arange(800) % 10 == 0, 3.0, rng.normal(0, NOISE, 800))
+    assert of_followed_body(pair, pair.y).all()
+
+
+def test_a_pair_without_inliers_follows_no_body_more_than_another() -> None:
+    pair = pair_with_a_lorry(np.random.default_rng(0))
+    pair.inliers[:] = False
+    assert of_followed_body(pair, pair.y).all()
+
+
+@pytest.mark.parametrize('count', [1, 5])
+def test_a_few_matches_tell_of_a_body_too(count: int) -> None:
+    y = np.random.default_rng(0).uniform((0, 0), SIZE, (count, 2))
+    pair = RelativePose(Status.OK, x=y, y=y, inliers=np.ones(count, bool),
+                        voting=np.ones(count, bool), residuals=np.full(count, NOISE))
+    assert of_followed_body(pair, y[:1] + np.arange(20).reshape(10, 2)).all()
+    pair.residuals[:] = 1.0
+    pair = RelativePose(Status.OK, x=y, y=y, inliers=np.arange(count) == 0,
+                        voting=np.ones(count, bool), residuals=np.where(np.arange(count), 9, 0.1))
+    assert len(of_followed_body(pair, y)) == count
+
+
+class Overtaking:
+    """
+    Matches of a static world and of a lorry in the right half, which moves in about its direction.
+
+    The lorry is slower than the camera, and its apparent motion is some degrees aside.
+    """
+
+    def __init__(self, seed: int, aside: float = 6.0, lorry: int = LORRY) -> None:
+        rng = np.random.default_rng(seed)
+        turn = rotation_exp(rng.normal(0, 0.003, 3))
+        self.static = Pose(turn, AHEAD)
+        angle = np.radians(aside)
+        self.lorry = Pose(turn, rotation_exp(np.array([0, angle, 0])) @ AHEAD)
+        still = rng.uniform((20, 20), np.array(SIZE) - 20, (STATIC, 2))
+        box = rng.uniform((0.55 * SIZE[0], 40), (0.95 * SIZE[0], SIZE[1] - 40), (lorry, 2))
+        far = rng.uniform(10, 60, STATIC)
+        outside = still[:, 0] < 0.5 * SIZE[0]
+        still, far = still[outside], far[outside]
+        false = rng.uniform((20, 20), np.array(SIZE) - 20, (FALSE, 2))
+        places = [seen_after(still, far, turn, AHEAD),
+                  seen_after(box, rng.uniform(8, 12, lorry), turn, 0.5 * self.lorry.t),
+                  false + rng.normal(0, 15, false.shape)]
+        self.x, self.y = np.concatenate([still, box, false]), np.concatenate(places)
+        self.y += rng.normal(0, NOISE, self.y.shape)
+        self.of_lorry = (np.arange(len(self.x)) >= len(still)) & (
+            np.arange(len(self.x)) < len(still) + lorry)
+        self.of_static = np.arange(len(self.x)) < len(still)
+        self.prior = Pose(rotation_exp(rng.normal(0, 0.001, 3)) @ turn, unit(
+            AHEAD + rng.normal(0, 0.003, 3)))
+
+    @property
+    def problem(self) -> JetProblem:
+        """Return the problem of the re-projection errors of all matches."""
+        return jet_problem(K, self.x, ReprojectionSurface(self.x, self.y).fit_around(self.y))
+
+    def fitted(self, start: Pose) -> Pose:
+        """Return the pose of all matches in the basin of a start."""
+        return refine_all(self.problem, [start], Loss('geman_mcclure', 3 * NOISE), 20).pose(0)
+
+    def pair(self, pose: Pose, left_out: np.ndarray) -> RelativePose:
+        """Return the pair that follows a pose, without some of its matches."""
+        residuals = line_distances(epipolar_lines(fundamental(K, pose.R, pose.t), self.x), self.y)
+        return RelativePose(
+            Status.OK, pose.R, pose.t, x=self.x, y=self.y, residuals=residuals,
+            inliers=~left_out & (np.abs(residuals) < 3 * NOISE), voting=~left_out,
+            left_out=left_out)
+
+
+def seen_after(x: np.ndarray, depths: np.ndarray, R: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Return where points at pixels x (N, 2) and some depths (N,) are seen after a motion."""
+    rays = np.column_stack([x, np.ones(len(x))]) @ np.linalg.inv(K).T
+    return np.asarray(project(K, rays * depths[:, None] @ R.T + t)[0])
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_the_motion_that_continues_is_found_behind_that_of_a_majority(seed: int) -> None:
+    seen = Overtaking(seed)
+    of_majority = seen.fitted(seen.lorry)
+    # Far points of the static world draw it a little.
+    assert pose_distance(of_majority, seen.lorry) < 0.03 < pose_distance(of_majority, seen.static)
+    found = continuing_motion(seen.problem, seen.x, seen.prior, of_majority, NOISE)
+    assert found is not None and pose_distance(found.pose, seen.static) < 0.005
+    # The rest fits either motion, where their lines are the same.
+    assert found.other[seen.of_lorry].mean() > 0.75
+    assert found.other[seen.of_static].mean() < 0.05
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_false_matches_do_not_continue_a_motion(seed: int) -> None:
+    """The camera turns off from its previous motion, and nothing else moves."""
+    seen = Overtaking(seed, lorry=0)
+    turned = Pose(rotation_exp(np.array([0, 0.08, 0])) @ seen.prior.R, seen.prior.t)
+    assert continuing_motion(seen.problem, seen.x, turned, seen.static, NOISE) is None
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_a_motion_close_to_the_previous_one_continues_it(seed: int) -> None:
+    seen = Overtaking(seed)
+    own = seen.fitted(seen.static)
+    assert continuing_motion(seen.problem, seen.x, seen.prior, own, NOISE) is None
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_static_matches_are_readmitted_and_those_of_a_lorry_are_not(seed: int) -> None:
+    seen = Overtaking(seed)
+    # A third of the static world was left out with the lorry.
+    left_out = seen.of_lorry | (seen.of_static & (np.arange(len(seen.x)) % 3 == 0))
+    back = readmitted(seen.pair(seen.static, left_out), K)
+    assert not (back & ~left_out).any()
+    # The others fit the motion of the lorry too, by chance.
+    assert back[seen.of_static & left_out].mean() > 0.4
+    assert back[seen.of_lorry].mean() < 0.05
+
+
+def test_a_lorry_as_fast_as_the_camera_fits_its_motion() -> None:
+    apart, alike = Overtaking(0), Overtaking(0, aside=0.0)
+    assert not fits_followed_body(apart.pair(apart.static, apart.of_lorry))
+    assert fits_followed_body(alike.pair(alike.static, alike.of_lorry))
+
+
+@pytest.mark.slow
+def test_while_a_lorry_is_overtaken_the_camera_keeps_its_own_motion():
+    """The lorry moves along the same road, and has up to two thirds of the matches."""
+    scene, estimator = make_scene('motorway', seed=1), TwoViewEstimator()
+    poses, before, prior = scene.trajectory(32), None, None
+    for index in range(24, 32):
+        view = estimator.view(scene.render(poses[index], index), scene.K)
+        if before is not None:
+            prior = estimator.estimate(before, view, prior)
+            truth = np.linalg.inv(poses[index]) @ poses[index - 1]
+            assert prior.status is Status.OK
+            assert np.degrees(rotation_angle(prior.R, truth[:3, :3])) < 0.02
+            assert np.degrees(direction_angle(prior.t, truth[:3, 3])) < 0.4
+        before = view
+    # Matches on the lorry are kept, as outliers.
+    assert prior is not None and prior.inliers.sum() < 0.4 * len(prior.x)
