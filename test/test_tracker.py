@@ -759,6 +759,17 @@ def test_a_debug_image_draws_a_residual_twenty_times_as_long_towards_the_line():
     assert columns[left].max() <= 81 and columns[left].min() == pytest.approx(60, abs=1)
 
 
+def test_a_debug_image_tells_outliers_from_another_body():
+    x = np.array([[30.0, 30], [60, 60], [90, 45]])
+    y = np.add(x, (10, 0))
+    drawn = debug_image(np.full((90, 120), 50, np.uint8), RelativePose(
+        Status.OK, x=x, y=y, inliers=np.array([True, False, False]),
+        left_out=np.array([False, False, True])))
+    middles = np.rint((x + y) / 2).astype(int)
+    # Of blue, green and red most is …
+    assert [int(drawn[row, column].argmax()) for column, row in middles] == [1, 2, 0]
+
+
 def test_landmarks_are_a_cloud_in_front_of_the_camera(drive):
     one = tracker()
     play(one, drive[:1])

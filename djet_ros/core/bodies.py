@@ -50,6 +50,9 @@ _FEWEST = int(np.ceil(-np.log2(_SIGNIFICANCE)))
 # a continuing one may be: twice as much, and false matches seemed to continue a motion.
 _STEADY, CONTINUING = 0.01, 0.05
 
+# pixels; of matches without any
+_LEAST_NOISE = 1e-6
+
 # chosen: steps of the optimiser, and how often the other body is determined anew.
 _STEPS, _REPETITIONS = 6, 2
 
@@ -83,7 +86,8 @@ def _evidence(pair: RelativePose) -> Array:
 
 def _errors(pair: RelativePose) -> Array:
     """Return the distances (N,) of matches from their lines, in robust standard deviations."""
-    return np.abs(pair.residuals) / robust_scale(pair.residuals[pair.inliers])
+    noise = max(robust_scale(pair.residuals[pair.inliers]), _LEAST_NOISE)
+    return np.asarray(np.abs(pair.residuals) / noise)
 
 
 def _nearest(places: Array, x: Array) -> NDArray[np.int64]:
@@ -102,7 +106,8 @@ def readmitted(pair: RelativePose, K: Array) -> NDArray[np.bool_]:
     """
     Return which matches (N,) a pair left out that are not of another body after all.
 
-    They fit the motion of the pair, and not that of the other body. K: (3, 3).
+    They fit the motion of the pair, and not that of the other body. All if they are too few for a
+    body. K: (3, 3).
     """
     chosen = ~pair.of_body
     if chosen.sum() < _FEWEST:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 MAGNIFICATION = 20.0
 
 _INLIER, _OUTLIER, _RESIDUAL = (80, 220, 80), (60, 60, 230), (0, 210, 255)
+_OTHER_BODY = (230, 140, 60)
 
 # Fractional bits of the integer coordinates for OpenCV.
 _SHIFT = 4
@@ -20,13 +21,18 @@ def debug_image(gray: NDArray[np.uint8], relative: RelativePose) -> NDArray[np.u
     """
     Draw a pair on its current image (H, W), return (H, W, 3) BGR.
 
-    Green: displacement of an inlier from x to y; red: of an outlier; yellow: 20 times the residual
-    from y to the optimum on its epipolar line.
+    Green: displacement of an inlier from x to y; red: of an outlier; blue: of a match of another
+    body, which was left out; yellow: 20 times the residual from y to the optimum on its epipolar
+    line.
     """
     picture = np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
     inliers = (relative.inliers if len(relative.inliers) == len(relative.x)
                else np.zeros(len(relative.x), bool))
-    _draw(picture, relative.x[~inliers], relative.y[~inliers], _OUTLIER)
+    left_out = (np.zeros(len(relative.x), bool) if relative.left_out is None
+                else relative.left_out)
+    _draw(picture, relative.x[left_out], relative.y[left_out], _OTHER_BODY)
+    outliers = ~inliers & ~left_out
+    _draw(picture, relative.x[outliers], relative.y[outliers], _OUTLIER)
     _draw(picture, relative.x[inliers], relative.y[inliers], _INLIER)
     if len(relative.y_opt) == len(relative.y):
         y, y_opt = relative.y[inliers], relative.y_opt[inliers]
