@@ -186,6 +186,17 @@ def test_false_matches_do_not_continue_a_motion(seed: int) -> None:
 
 
 @pytest.mark.parametrize('seed', range(5))
+def test_a_few_matches_that_continue_a_motion_are_no_body(seed: int) -> None:
+    """As leaves of a forest, when the camera turns off."""
+    for matches, enough in ((25, False), (200, True)):
+        seen = Overtaking(seed, lorry=matches)
+        true = np.flatnonzero(seen.of_static | seen.of_lorry)
+        found = continuing_motion(seen.problem.subset(true), seen.x[true], seen.lorry, seen.static,
+                                  NOISE)
+        assert (found is not None) == enough
+
+
+@pytest.mark.parametrize('seed', range(5))
 def test_a_motion_close_to_the_previous_one_continues_it(seed: int) -> None:
     seen = Overtaking(seed)
     own = seen.fitted(seen.static)

@@ -136,16 +136,17 @@ def continuing_motion(problem: JetProblem, places: Array, prior: Pose, pose: Pos
     While a lorry is overtaken, its matches become the majority, and the pose that fits them may
     still fit most of the others. The rest are outliers, many of which agree with a motion near the
     previous one. By chance, as many would if they were on the other side of their epipolar lines;
-    the sign test compares the two. None if it does not decide, or if the pose continues the
-    previous motion, prior, as well. places: (N, 2) pixels; noise: robust standard deviation of the
-    inliers' residuals.
+    the sign test compares the two. None if it does not decide, if the pose continues the previous
+    motion, prior, as well, or if nearly all matches fit it. places: (N, 2) pixels; noise: robust
+    standard deviation of the inliers' residuals.
     """
     pose = _aligned(pose, prior)
     if pose_distance(prior, pose) < _STEADY:
         return None
     errors = _residuals(problem, pose) / noise
     outliers = np.abs(errors) > _CONTRADICTING
-    if outliers.sum() < _FEWEST:
+    alone = (np.abs(errors) < _FITTING).mean() > 1 - MIN_BODY_SHARE
+    if alone or outliers.sum() < _FEWEST:
         return None
     found = fit_motion(problem.subset(np.flatnonzero(outliers)), prior, noise)
     tight = Loss('geman_mcclure', _FITTING * noise)
