@@ -1,5 +1,7 @@
 """Several bodies that move: the one that was followed is followed on, whatever the majority."""
 
+from dataclasses import replace
+
 from djet_ros.core.bodies import (
     continuing_motion,
     fits_followed_body,
@@ -76,13 +78,7 @@ def test_places_that_were_left_out_come_back_once_most_fit_closely() -> None:
     pair.residuals[500:] = rng.normal(0, 2 * NOISE, 300)
     assert of_followed_body(pair, x)[~left].mean() < 0.01
     # If they were not left out before, the same errors are no evidence of another body.
-    assert of_followed_body(pair_with_residuals(pair), x)[~left].all()
-
-
-def pair_with_residuals(pair: RelativePose) -> RelativePose:
-    """Return a pair with the same errors that left out none of its matches."""
-    return RelativePose(Status.OK, x=pair.x, y=pair.y, inliers=pair.inliers, voting=pair.voting,
-                        residuals=pair.residuals)
+    assert of_followed_body(replace(pair, left_out=None), x)[~left].all()
 
 
 def test_scattered_outliers_are_no_body() -> None:
@@ -104,7 +100,6 @@ def test_a_few_matches_tell_of_a_body_too(count: int) -> None:
     pair = RelativePose(Status.OK, x=y, y=y, inliers=np.ones(count, bool),
                         voting=np.ones(count, bool), residuals=np.full(count, NOISE))
     assert of_followed_body(pair, y[:1] + np.arange(20).reshape(10, 2)).all()
-    pair.residuals[:] = 1.0
     pair = RelativePose(Status.OK, x=y, y=y, inliers=np.arange(count) == 0,
                         voting=np.ones(count, bool), residuals=np.where(np.arange(count), 9, 0.1))
     assert len(of_followed_body(pair, y)) == count

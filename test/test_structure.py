@@ -281,7 +281,6 @@ def test_the_usual_speed_is_a_mean_over_half_a_second_unless_a_step_is_well_know
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_the_scale_lasts_in_a_fast_hand_with_a_rolling_shutter(freiburg1_rpy):
     """
     A path that shrinks to a point fits the truth by a common scale as well as this one.

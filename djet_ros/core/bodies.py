@@ -11,12 +11,16 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from djet_ros.core.basins import MIN_SCALE
 from djet_ros.core.jet import epipolar_residuals, jet_problem, JetProblem, Loss, robust_scale
 from djet_ros.core.rivals import (
     continues_motion,
     fit_motion,
+    INLIER,
     MIN_BODY_SHARE,
+    OUTLIER,
     pose_distance,
+    PreviousMotion,
 )
 from djet_ros.core.sketch import refine_all
 from djet_ros.core.surfaces import ReprojectionSurface
@@ -26,13 +30,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
-# Robust standard deviations within which a match fits a motion, and beyond which it contradicts
-# it.
-_FITTING, _CONTRADICTING = 3.0, 6.0
-
-# chosen: the same for a match that was left out as of another body; and by how much a fitting one
-# counts against one that contradicts. A body that moves in about the same direction fits by chance
-# in much of its area.
+# Robust standard deviations within which a match that was left out as of another body fits a
+# motion after all; and by how much that counts against one that does not; chosen: a body that
+# moves in about the same direction fits by chance in much of its area.
 _FITTING_LEFT_OUT, _BY_CHANCE = 1.0, 1 / 3
 
 # chosen: number of matches around a place that tell of which body it is; of a body, more than a
@@ -48,10 +48,7 @@ _FEWEST = int(np.ceil(-np.log2(_SIGNIFICANCE)))
 
 # rad; chosen: a motion as close to the previous one continues it, whatever else moves; and how far
 # a continuing one may be: twice as much, and false matches seemed to continue a motion.
-_STEADY, CONTINUING = 0.01, 0.05
-
-# pixels; of matches without any
-_LEAST_NOISE = 1e-6
+_CLOSE, _CONTINUING = 0.01, 0.05
 
 # chosen: steps of the optimiser, and how often the other body is determined anew.
 _STEPS, _REPETITIONS = 6, 2
@@ -76,8 +73,8 @@ def of_followed_body(before: RelativePose, x: Array) -> NDArray[np.bool_]:
 def _evidence(pair: RelativePose) -> Array:
     """Return the evidence (N,) of matches that they are of the body whose motion a pair has."""
     errors = _errors(pair)
-    contradicting = np.where(errors > _CONTRADICTING, -1.0, 0.0)
-    evidence = np.where(errors < _FITTING, 1.0, contradicting)
+    contradicting = np.where(errors > OUTLIER, -1.0, 0.0)
+    evidence = np.where(errors < INLIER, 1.0, contradicting)
     if pair.left_out is not None:
         by_chance = np.where(errors < _FITTING_LEFT_OUT, _BY_CHANCE, -1.0)
         evidence[pair.left_out] = by_chance[pair.left_out]
@@ -86,8 +83,11 @@ def _evidence(pair: RelativePose) -> Array:
 
 def _errors(pair: RelativePose) -> Array:
     """Return the distances (N,) of matches from their lines, in robust standard deviations."""
-    noise = max(robust_scale(pair.residuals[pair.inliers]), _LEAST_NOISE)
-    return np.asarray(np.abs(pair.residuals) / noise)
+    return np.asarray(np.abs(pair.residuals) / _noise(pair))
+
+
+def _noise(pair: RelativePose) -> float:
+    return max(robust_scale(pair.residuals[pair.inliers]), MIN_SCALE)
 
 
 def _nearest(places: Array, x: Array) -> NDArray[np.int64]:
@@ -96,9 +96,15 @@ def _nearest(places: Array, x: Array) -> NDArray[np.int64]:
     return np.asarray(cKDTree(places).query(x, count)[1]).reshape(len(x), count)
 
 
+def is_continued(prior: PreviousMotion | None, pair: RelativePose) -> bool:
+    """Return whether a pair goes on by the previous motion, of which the pair before was sure."""
+    return (prior is not None and not prior.undecided
+            and pose_distance(prior, Pose(pair.R, pair.t)) < _CONTINUING)
+
+
 def fits_followed_body(pair: RelativePose) -> bool:
     """Return whether most of the matches that a pair left out fit its motion."""
-    fitting = _errors(pair)[~pair.of_body] < _FITTING
+    fitting = _errors(pair)[~pair.of_body] < INLIER
     return bool(2 * fitting.sum() > len(fitting))
 
 
@@ -114,10 +120,10 @@ def readmitted(pair: RelativePose, K: Array) -> NDArray[np.bool_]:
         return chosen
     x, y = pair.x[chosen], pair.y[chosen]
     problem = jet_problem(K, x, ReprojectionSurface(x, y).fit_around(y))
-    noise = robust_scale(pair.residuals[pair.inliers])
+    noise = _noise(pair)
     other = fit_motion(problem, Pose(pair.R, pair.t), noise)
-    of_other = np.abs(epipolar_residuals(problem, other.R, other.t).r) < _FITTING * noise
-    chosen[chosen] = (_errors(pair)[chosen] < _FITTING) & ~of_other
+    of_other = np.abs(epipolar_residuals(problem, other.R, other.t).r) < INLIER * noise
+    chosen[chosen] = (_errors(pair)[chosen] < INLIER) & ~of_other
     return chosen
 
 
@@ -141,15 +147,15 @@ def continuing_motion(problem: JetProblem, places: Array, prior: Pose, pose: Pos
     standard deviation of the inliers' residuals.
     """
     pose = _aligned(pose, prior)
-    if pose_distance(prior, pose) < _STEADY:
+    if pose_distance(prior, pose) < _CLOSE:
         return None
     errors = _residuals(problem, pose) / noise
-    outliers = np.abs(errors) > _CONTRADICTING
-    alone = (np.abs(errors) < _FITTING).mean() > 1 - MIN_BODY_SHARE
+    outliers = np.abs(errors) > OUTLIER
+    alone = (np.abs(errors) < INLIER).mean() > 1 - MIN_BODY_SHARE
     if alone or outliers.sum() < _FEWEST:
         return None
     found = fit_motion(problem.subset(np.flatnonzero(outliers)), prior, noise)
-    tight = Loss('geman_mcclure', _FITTING * noise)
+    tight = Loss('geman_mcclure', INLIER * noise)
     for _ in range(_REPETITIONS):
         other = _of_other(places, _residuals(problem, found) / noise, errors)
         if (~other).sum() < _FEWEST:
@@ -158,7 +164,7 @@ def continuing_motion(problem: JetProblem, places: Array, prior: Pose, pose: Pos
         found = refine_all(rest, [found], tight, _STEPS).pose(0)
     found = _aligned(found, prior)
     own = _residuals(problem, found) / noise
-    if (pose_distance(prior, found) > CONTINUING or not continues_motion(prior, found, pose)
+    if (pose_distance(prior, found) > _CONTINUING or not continues_motion(prior, found, pose)
             or not _is_significant(own[outliers], errors[outliers])):
         return None
     return Continuing(found, _of_other(places, own, errors))
@@ -179,7 +185,7 @@ def _of_other(places: Array, own: Array, other: Array) -> NDArray[np.bool_]:
 
     places: (N, 2); own, other: (N,) residuals to both motions, in standard deviations.
     """
-    fits_own, fits_other = np.abs(own) < _FITTING, np.abs(other) < _FITTING
+    fits_own, fits_other = np.abs(own) < INLIER, np.abs(other) < INLIER
     known, only_other = np.flatnonzero(fits_own | fits_other), fits_other & ~fits_own
     if not len(known):
         return only_other
@@ -194,5 +200,5 @@ def _is_significant(own: Array, other: Array) -> bool:
     own, other: (M,) their residuals to both, in standard deviations. Mirrored at the line of the
     other motion, a match has the residual own - 2 other.
     """
-    agreeing, mirrored = (int((np.abs(each) < _FITTING).sum()) for each in (own, own - 2 * other))
+    agreeing, mirrored = (int((np.abs(each) < INLIER).sum()) for each in (own, own - 2 * other))
     return bool(agreeing and bdtrc(agreeing - 1, agreeing + mirrored, 0.5) < _SIGNIFICANCE)

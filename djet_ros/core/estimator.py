@@ -10,8 +10,8 @@ from time import perf_counter
 from djet_ros.core.algorithm import evaluate_at, Track
 from djet_ros.core.basins import BASIN_TUNING
 from djet_ros.core.bodies import (
-    CONTINUING,
     fits_followed_body,
+    is_continued,
     of_followed_body,
     readmitted,
 )
@@ -31,7 +31,6 @@ from djet_ros.core.radial import undistort_image
 from djet_ros.core.rivals import (
     continues_motion,
     MIN_BODY_SHARE,
-    pose_distance,
     PreviousMotion,
 )
 from djet_ros.core.starts import (
@@ -159,11 +158,14 @@ class TwoViewEstimator:
         fit a compromise of both motions. But all are used if no other body moves any more, or if
         they go on by the previous motion, or by one that the previous pair left open.
         """
-        followed = np.ones(len(pair.x), bool) if prior is None else of_followed_body(prior, pair.x)
-        if prior is None or (~followed).sum() <= MIN_BODY_SHARE * len(followed):
+        if prior is None:
+            return self.estimate_pair(pair)
+        followed = of_followed_body(prior, pair.x)
+        if (~followed).sum() <= MIN_BODY_SHARE * len(followed):
             return self.estimate_pair(pair)
         alone = self._estimate_alone(pair, prior, followed)
-        if alone is not None and _is_steady(alone, pair.prior) and not fits_followed_body(alone):
+        if (alone is not None and is_continued(pair.prior, alone)
+                and not fits_followed_body(alone)):
             return alone
         result = self.estimate_pair(pair)
         if alone is None or _is_same(alone, result):
@@ -353,12 +355,6 @@ def _within_limits(result: RelativePose, limits: Limits) -> bool:
     return (result.status in (Status.OK, Status.NO_PARALLAX)
             and robust_scale(result.residuals[result.of_body]) < limits.max_noise
             and result.inliers[result.of_body].mean() > limits.min_agreeing)
-
-
-def _is_steady(relative: RelativePose, prior: PreviousMotion | None) -> bool:
-    """Return whether a motion goes on as the previous one, of which its pair was sure."""
-    return (prior is not None and not prior.undecided
-            and pose_distance(prior, _pose(relative)) < CONTINUING)
 
 
 def _is_same(one: RelativePose, other: RelativePose) -> bool:

@@ -35,7 +35,7 @@ _STEPS = 6
 
 # Robust standard deviations beyond which a match is an outlier of a motion, and within which it is
 # an inlier.
-_OUTLIER, _INLIER = 6.0, 3.0
+OUTLIER, INLIER = 6.0, 3.0
 
 # chosen: a body with less than this share of the matches is not mistaken for the static world.
 MIN_BODY_SHARE = 0.125
@@ -163,7 +163,7 @@ def is_planar(x: Array, y: Array, noise: float) -> bool:
     may remain that determine the motion. noise: robust standard deviation in pixels.
     """
     subset = subsampled(len(x), _REFINED_ON)
-    H, _ = cv2.findHomography(x[subset], y[subset], cv2.USAC_MAGSAC, _INLIER * noise)
+    H, _ = cv2.findHomography(x[subset], y[subset], cv2.USAC_MAGSAC, INLIER * noise)
     return H is not None and _fits_homography(np.asarray(H, np.float64), x, y, noise)
 
 
@@ -174,7 +174,7 @@ def _fits_homography(H: Array, x: Array, y: Array, noise: float) -> bool:
     errors = norms(cv2.perspectiveTransform(x[:, None], H)[:, 0] - y)
     # For normal errors in both directions the median distance is 1.18 standard deviations.
     return bool(np.median(errors) < _MAX_EXCESS * 1.18 * noise
-                and (errors > _OUTLIER * noise).mean() < _MAX_OFF_PLANE)
+                and (errors > OUTLIER * noise).mean() < _MAX_OFF_PLANE)
 
 
 def planar_twin(pose: Pose, K: Array, x: Array, y: Array, noise: float) -> Rival | None:
@@ -231,20 +231,20 @@ def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
     half of them agree: false matches that are off by a few pixels agree with many motions.
     """
     lines = refine_all(problem, [first], Loss(), 0)
-    first = _with_chirality(problem, first, np.abs(lines.r[0]) < _INLIER * scale)
+    first = _with_chirality(problem, first, np.abs(lines.r[0]) < INLIER * scale)
     scale = min(max(robust_scale(lines.r[0]), scale), 3 * scale)
     distances = _distances(problem, replace(lines, t=first.t[None]))
-    outliers = np.flatnonzero(distances > _OUTLIER * scale)
-    least = max(least, round(MIN_BODY_SHARE * (distances < _INLIER * scale).sum()))
+    outliers = np.flatnonzero(distances > OUTLIER * scale)
+    least = max(least, round(MIN_BODY_SHARE * (distances < INLIER * scale).sum()))
     if len(outliers) < least:
         return None
     pose = fit_motion(problem.subset(outliers), first, scale)
-    members = _distances(problem, refine_all(problem, [pose], Loss(), 0)) < _INLIER * scale
+    members = _distances(problem, refine_all(problem, [pose], Loss(), 0)) < INLIER * scale
     agreeing = members[outliers].sum()
     if agreeing < least or agreeing <= len(outliers) / 2:
         return None
-    only_first = (distances < _INLIER * scale) & ~members
-    only_second = members & (distances > _OUTLIER * scale)
+    only_first = (distances < INLIER * scale) & ~members
+    only_second = members & (distances > OUTLIER * scale)
     return SecondMotion(first, pose, members,
                         _area(places[only_second]) / max(_area(places[only_first]), 1e-9),
                         (_flatness(problem.subset(only_first), first),
@@ -253,13 +253,13 @@ def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
 
 def fit_motion(problem: JetProblem, near: Pose, scale: float) -> Pose:
     """Fit the motion with most inliers among some matches, from starts around another motion."""
-    rough, tight = (Loss('geman_mcclure', share * scale) for share in (_OUTLIER, _INLIER))
+    rough, tight = (Loss('geman_mcclure', share * scale) for share in (OUTLIER, INLIER))
     subset = problem.subset(subsampled(len(problem.blur), _MAX_OUTLIERS))
     sketch = refine_all(subset, starts_around(near, _DIRECTIONS), rough, _STEPS)
     candidates = refine_all(problem, sketch.poses(), tight, 1)
     best = int(losses_in_front(problem, candidates, tight).sum(1).argmin())
     refined = refine_all(problem, [candidates.pose(best)], tight, _STEPS)
-    return _with_chirality(problem, refined.pose(0), np.abs(refined.r[0]) < _INLIER * scale)
+    return _with_chirality(problem, refined.pose(0), np.abs(refined.r[0]) < INLIER * scale)
 
 
 def motion_without_attached(problem: JetProblem, fixed: NDArray[np.bool_], pose: Pose,
@@ -284,11 +284,11 @@ def motion_without_attached(problem: JetProblem, fixed: NDArray[np.bool_], pose:
     motion = fit_motion(moving, pose, scale)
     # Matches that stay in place are less noisy than those that move.
     scale = max(clipped_scale(refine_all(moving, [motion], Loss(), 0).r[0]), scale)
-    tight = refine_all(moving, [motion], Loss('geman_mcclure', _INLIER * scale), _STEPS)
-    motion = _with_chirality(moving, tight.pose(0), np.abs(tight.r[0]) < _INLIER * scale)
+    tight = refine_all(moving, [motion], Loss('geman_mcclure', INLIER * scale), _STEPS)
+    motion = _with_chirality(moving, tight.pose(0), np.abs(tight.r[0]) < INLIER * scale)
     distances = _distances(problem, refine_all(problem, [motion], Loss(), 0))
-    agree = distances[~fixed] < _INLIER * scale
-    attached = (distances[fixed] > _OUTLIER * scale).sum()
+    agree = distances[~fixed] < INLIER * scale
+    attached = (distances[fixed] > OUTLIER * scale).sum()
     if agree.mean() <= 0.5 or attached < least or attached <= fixed.sum() / 2:
         return None
     deep = _flatness(moving.subset(agree), motion) < DEEP_RATIO
