@@ -14,7 +14,7 @@ from djet_ros.config.flat import from_flat
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.geometry import direction_angle, rotation_angle
 from djet_ros.core.masks import blocked, masked_at
-from djet_ros.core.types import Array
+from djet_ros.core.types import Array, Status
 from djet_ros.errors import DjetError
 from djet_ros.lab.scenes.imu import feel, FeltMotion, Mems
 from djet_ros.live.session import Session
@@ -379,6 +379,7 @@ def test_masked_pixels_have_no_influence(drive: Drive, kind: str) -> None:
     values: dict[str, Any] = {'still': mask < 128} if kind == 'file' else {'odometry.mask': True}
     masked, clean, bare = tracker(**values), tracker(**values), tracker()
     off: dict[Tracker, list[tuple[float, float]]] = {masked: [], clean: [], bare: []}
+    undisturbed = 0
     for i, gray in enumerate(drive.images):
         shown = gray.copy()
         shown[120:] = stuck
@@ -391,17 +392,19 @@ def test_masked_pixels_have_no_influence(drive: Drive, kind: str) -> None:
             assert one.last is not None
             if i:
                 off[one].append(drive.errors(i, one.last.motion))
+        undisturbed += bare.last is not None and bare.last.status is Status.OK
         assert masked.last is not None and clean.last is not None
         if i and masked.last.relative is not None and clean.last.relative is not None:
             seen, shared = (set(map(tuple, pair.x.round(1)))
                             for pair in (masked.last.relative, clean.last.relative))
             assert len(seen & shared) > 0.9 * len(shared)
             assert max(y for _, y in seen) < 120 - 12
-    # Masked pixels change the pose by less than a degree; without the mask by much more.
+    # Masked pixels change the pose by less than a degree. Without the mask nothing tells whether
+    # the camera moves above them, or stands still while the cards move.
     apart = np.abs(np.subtract(off[masked], off[clean]))
     assert (apart.max(0) < np.radians((0.1, 1))).all()
     assert (np.median(off[clean], axis=0) < np.radians((0.1, 1))).all()
-    assert max(direction for _, direction in off[bare]) > np.radians(4)
+    assert undisturbed == 0
 
 
 def test_a_mask_of_another_size_is_an_error_and_not_forgotten(drive: Drive) -> None:

@@ -33,9 +33,9 @@ def djet(*arguments: object) -> CompletedProcess[str]:
 
 
 def record(square: float = 1.0, failed: bool = False, claims: tuple[float, float] = (0.1, 1.0),
-           status: Status = Status.OK, scene: str = 'road') -> Coverage:
+           status: Status = Status.OK, scene: str = 'road', stood: bool = False) -> Coverage:
     return Coverage(scene, f'{scene}-1', 'alone', 4, 5, status.value, failed, 2.0, 20.0, *claims,
-                    square, 100, 90)
+                    square, 100, 90, stood)
 
 
 def test_errors_drawn_from_the_covariance_lie_inside_as_often_as_claimed() -> None:
@@ -122,6 +122,17 @@ def test_a_motion_taken_for_a_standstill_is_counted() -> None:
     row, = coverage_rows([record(failed=True), stood, moved,
                           record(square=nan, status=Status.DEGENERATE, failed=True)])
     assert (row.pairs, row.told, row.failed, row.untold, row.given_up) == (4, 1, 1, 1, 1)
+
+
+def test_a_motion_invented_of_a_standstill_is_wrong_and_sure() -> None:
+    nan = float('nan')
+    invented = record(square=nan, stood=True)
+    assert invented.overconfident
+    humble = record(square=nan, stood=True, claims=(0.1, 50.0))
+    held = record(square=nan, stood=True, status=Status.TWO_MOTIONS)
+    row, = coverage_rows([invented, humble, held, record(square=nan, claims=(0.1, 50.0))])
+    assert (row.told, row.failed, row.given_up, row.needlessly, row.wrong_and_sure) == (
+        0, 1, 1, 0, 1)
 
 
 def test_a_recorded_table_shows_unreported_errors_or_a_dash_if_they_were_not_counted(

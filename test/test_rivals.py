@@ -40,7 +40,7 @@ from djet_ros.core.rivals import (
     unsigned_distance,
 )
 from djet_ros.core.sketch import losses_at
-from djet_ros.core.starts import hemisphere_starts
+from djet_ros.core.starts import hemisphere_starts, KnownMotion
 from djet_ros.core.surfaces import ReprojectionSurface
 from djet_ros.core.types import Pose, RelativePose, Rival, Status
 from djet_ros.core.verdict import _compare_with_rivals, as_decided, as_pure_rotation
@@ -212,6 +212,51 @@ def test_what_stays_in_place_before_a_standing_camera_is_kept_while_a_lorry_pass
     x, y = np.concatenate([still, x]), np.concatenate([still, y])
     y[:300] += rng.normal(0, NOISE, still.shape)
     assert len(estimate(x, y).x) == len(x)
+
+
+def test_a_body_that_passes_may_move_instead_of_the_camera() -> None:
+    """To its motion what stands still is infinitely far; only the previous motion tells more."""
+    rng = np.random.default_rng(0)
+    seen = two_views(rng, count=600, t=SIDEWAYS, turn=(0.0, 0.0, 0.0), near=8, far=9)
+    still = rng.uniform((0, 0), SIZE, (60, 2))
+    x, y = np.concatenate([seen.x, still]), np.concatenate([seen.y, still])
+    y += rng.normal(0, NOISE, y.shape)
+    for prior, status in ((None, Status.TWO_MOTIONS), (Pose(seen.R, seen.t), Status.OK),
+                          (Pose(seen.R, np.array(FORWARD)), Status.TWO_MOTIONS)):
+        result = estimate(x, y, prior)
+        assert result.status is status
+        sigma = np.degrees(np.sqrt(np.trace(result.covariance_5[3:, 3:])))
+        assert (sigma > 90) == (status is Status.TWO_MOTIONS)
+
+
+@pytest.mark.parametrize('differs', ['depths', 'turn', 'slightly'])
+def test_a_camera_that_moves_past_something_distant_does_not_stand(differs: str) -> None:
+    """It sees depths from near to far, or turns, or sees places that move slightly."""
+    rng = np.random.default_rng(0)
+    turn = (0.0, 0.01, 0.0) if differs == 'turn' else (0.0, 0.0, 0.0)
+    far = 80.0 if differs == 'depths' else 9.0
+    seen = two_views(rng, count=600, t=SIDEWAYS, turn=turn, near=8, far=far)
+    near, far = (200, 1000) if differs == 'slightly' else (1000, 9000)
+    distant = two_views(rng, count=200, t=SIDEWAYS, turn=turn, near=near, far=far)
+    x, y = (np.concatenate([getattr(seen, each), getattr(distant, each)]) for each in 'xy')
+    y += rng.normal(0, NOISE, y.shape)
+    result = estimate(x, y)
+    assert result.status is Status.OK
+    assert direction_angle(result.t, seen.t) < 0.02
+
+
+def test_what_stays_in_place_before_a_camera_that_stood_is_not_attached_to_it() -> None:
+    """All else moves by one motion, with depths from near to far."""
+    rng = np.random.default_rng(0)
+    seen = two_views(rng, count=400, t=FORWARD, turn=(0.0, 0.012, 0.0))
+    still = rng.uniform((0, 250), SIZE, (200, 2))
+    x, y = np.concatenate([seen.x, still]), np.concatenate([seen.y, still])
+    y += rng.normal(0, NOISE, y.shape) * np.where(np.arange(600) < 400, 1.0, 0.2)[:, None]
+    estimator = TwoViewEstimator(EstimatorConfig(method='rpe'))
+    for stood, kept in ((False, 0.0), (True, 1.0)):
+        result = estimator.estimate_pair(Pair(uniform_view(), uniform_view(), x, y,
+                                              known=KnownMotion(stood=stood)))
+        assert np.isin(still[:, 0], result.x[:, 0]).mean() == kept
 
 
 def test_a_static_sky_before_a_camera_without_rotation_is_kept() -> None:

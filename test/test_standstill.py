@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Array, RelativePose, Status
 from djet_ros.odometry.standstill import Standstill
 import numpy as np
@@ -12,6 +13,8 @@ import pytest
 
 MOST = 0.3
 RIGHT = np.array([1.0, 0.0])
+HORIZON = 188.0
+K = np.array([[700, 0, 620], [0, 700, HORIZON], [0, 0, 1]])
 WORLD = np.random.default_rng(3).uniform((0, 0), (1240, 376), (400, 2))
 
 
@@ -19,6 +22,18 @@ def seen(x: Array, y: Array, follow: NDArray[np.bool_] | None = None) -> Relativ
     """Return a pair whose inliers follow its motion."""
     return RelativePose(Status.OK, t=np.array([1.0, 0, 0]), x=x, y=y,
                         inliers=np.zeros(len(x), bool) if follow is None else follow)
+
+
+def detected(standstill: Standstill, pair: RelativePose, at_rest: bool | None) -> bool:
+    return standstill.detect(pair, MOST, at_rest, HORIZON)
+
+
+def likely_stands(standstill: Standstill, pair: RelativePose, at_rest: bool | None) -> bool:
+    return standstill.is_likely(pair, MOST, at_rest, HORIZON)
+
+
+def depart(standstill: Standstill, pair: RelativePose | None = None) -> None:
+    standstill.take(pair or seen(WORLD, WORLD + 60 * RIGHT), K, MOST)
 
 
 def scattered(x: Array) -> Array:
@@ -37,31 +52,31 @@ def behind_a_lorry(stand: int, lorry: int = 1000) -> RelativePose:
 
 def after_a_stand() -> Standstill:
     standstill = Standstill()
-    assert standstill.detect(seen(WORLD, WORLD), MOST, at_rest=False)
+    assert detected(standstill, seen(WORLD, WORLD), at_rest=False)
     standstill.stay(seen(WORLD, WORLD), MOST)
     return standstill
 
 
 def test_static_features_prove_a_standstill_however_few_are_visible() -> None:
     for stand, stationary in ((200, True), (15, True), (3, False)):
-        assert after_a_stand().detect(behind_a_lorry(stand), MOST, at_rest=True) is stationary
+        assert detected(after_a_stand(), behind_a_lorry(stand), at_rest=True) is stationary
 
 
-def test_static_features_need_a_gyro_at_rest_and_a_standstill_before() -> None:
-    assert not after_a_stand().detect(behind_a_lorry(40), MOST, at_rest=False)
-    assert not Standstill().detect(behind_a_lorry(40), MOST, at_rest=True)
+def test_static_features_need_no_rotation_and_a_standstill_before() -> None:
+    assert not detected(after_a_stand(), behind_a_lorry(40), at_rest=False)
+    assert not detected(Standstill(), behind_a_lorry(40), at_rest=True)
     elsewhere = after_a_stand()
     elsewhere.refer()
-    assert not elsewhere.detect(behind_a_lorry(40), MOST, at_rest=True)
+    assert not detected(elsewhere, behind_a_lorry(40), at_rest=True)
 
 
 def test_a_standstill_after_motion_needs_more_still_matches_than_at_first() -> None:
     for share, first, later in ((0.3, True, True), (0.1, True, False), (0.03, False, False)):
         pair = seen(WORLD, WORLD + np.where(np.arange(400) < 400 * share, 0, 60)[:, None] * RIGHT)
         standstill = Standstill()
-        assert standstill.detect(pair, MOST, at_rest=True) is first
-        standstill.moved()
-        assert standstill.detect(pair, MOST, at_rest=True) is later
+        assert detected(standstill, pair, at_rest=True) is first
+        depart(standstill)
+        assert detected(standstill, pair, at_rest=True) is later
 
 
 def test_distant_features_are_no_standstill_of_a_camera_that_starts() -> None:
@@ -69,19 +84,19 @@ def test_distant_features_are_no_standstill_of_a_camera_that_starts() -> None:
     y = WORLD + np.random.default_rng(6).uniform(2, 40, (400, 1)) * RIGHT
     y[:15] = WORLD[:15]
     away = seen(WORLD, y, np.ones(400, bool))
-    assert not after_a_stand().detect(away, MOST, at_rest=True)
+    assert not detected(after_a_stand(), away, at_rest=True)
     # The same for few static features.
     new = np.random.default_rng(8).uniform((0, 0), (1240, 376), (500, 2))
     few = seen(np.vstack([WORLD[:60], new]), np.vstack([y[:60], new + RIGHT * 20]),
                np.ones(560, bool))
-    assert not after_a_stand().detect(few, MOST, at_rest=True)
+    assert not detected(after_a_stand(), few, at_rest=True)
 
 
 def test_a_creeping_camera_is_stationary_only_briefly() -> None:
     """Near features move slightly at first, far ones later."""
     shift = 1.0 / np.random.default_rng(7).uniform(2, 60, (400, 1)) * RIGHT
-    stationary = [after_a_stand().detect(
-        seen(WORLD, WORLD + pixels * shift, np.ones(400, bool)), MOST, at_rest=True)
+    stationary = [detected(
+        after_a_stand(), seen(WORLD, WORLD + pixels * shift, np.ones(400, bool)), at_rest=True)
         for pixels in (1, 20, 40, 80)]
     assert stationary == [True, False, False, False]
 
@@ -89,13 +104,13 @@ def test_a_creeping_camera_is_stationary_only_briefly() -> None:
 def test_a_lorry_that_stood_and_left_is_not_static() -> None:
     standstill, lorry = after_a_stand(), np.arange(400) < 150
     away = seen(WORLD, WORLD + np.where(lorry[:, None], (30.0, 0), (0.0, 0)), lorry)
-    assert standstill.detect(away, MOST, at_rest=True)
+    assert detected(standstill, away, at_rest=True)
     standstill.stay(away, MOST)
     # Another one stops there, and hides the rest.
     beside = np.random.default_rng(9).uniform((0, 0), (1240, 376), (4000, 2))
     x = np.vstack([WORLD, beside])
     y = np.vstack([WORLD[:150], scattered(WORLD[150:]), beside + RIGHT * 40])
-    assert not standstill.detect(seen(x, y, np.arange(len(x)) >= 400), MOST, at_rest=True)
+    assert not detected(standstill, seen(x, y, np.arange(len(x)) >= 400), at_rest=True)
 
 
 def some_move(*shares_and_pixels: tuple[float, float], x: Array = WORLD) -> RelativePose:
@@ -110,8 +125,8 @@ def test_a_camera_that_moves_far_things_less_than_near_ones_does_not_stand() -> 
     starts = some_move((0.33, 0.0), (0.5, 2 * MOST), (0.17, 60.0))
     passes = some_move((0.33, 0.0), (0.1, 2 * MOST), (0.57, 60.0))
     for before in (Standstill(), after_a_stand()):
-        assert not before.detect(starts, MOST, at_rest=True)
-        assert before.detect(passes, MOST, at_rest=True)
+        assert not detected(before, starts, at_rest=True)
+        assert detected(before, passes, at_rest=True)
 
 
 def test_static_features_behind_a_lorry_that_move_slightly_are_those_of_a_camera_that_starts(
@@ -123,7 +138,7 @@ def test_static_features_behind_a_lorry_that_move_slightly_are_those_of_a_camera
         x = np.vstack([WORLD, np.random.default_rng(4).uniform((0, 0), (1240, 376), (2000, 2))])
         y = np.vstack([WORLD[:60] + pixels * RIGHT, scattered(hidden), x[400:] + panel])
         pair = seen(x, y, np.arange(len(x)) >= len(WORLD))
-        assert after_a_stand().detect(pair, MOST, at_rest=True) is stands
+        assert detected(after_a_stand(), pair, at_rest=True) is stands
 
 
 def test_features_that_a_body_hides_while_it_passes_stay_static_and_its_own_do_not() -> None:
@@ -138,36 +153,123 @@ def test_features_that_a_body_hides_while_it_passes_stay_static_and_its_own_do_n
                           ((np.arange(4500) >= 400) & ~follow, False)):
         y = np.vstack([scattered(x[:500]), lorry + 60 * RIGHT])
         pair = seen(x, np.where(still[:, None], x, y), follow)
-        assert standstill.detect(pair, MOST, at_rest=True) is stands
+        assert detected(standstill, pair, at_rest=True) is stands
 
 
 def test_dirt_on_the_lens_is_no_standstill() -> None:
     x = np.vstack([WORLD, np.random.default_rng(15).uniform((200, 100), (260, 160), (100, 2))])
     y = x + np.where(np.arange(500)[:, None] < 400, 60.0, 0.0) * RIGHT
-    assert not Standstill().detect(seen(x, y, np.arange(500) < 400), MOST, at_rest=True)
+    assert not detected(Standstill(), seen(x, y, np.arange(500) < 400), at_rest=True)
 
 
 def test_refined_matches_tell_whether_anything_moves_if_all_are_refined() -> None:
     """Matches are whole pixels, or of a detector that is off by a good part of one."""
     off = WORLD + np.random.default_rng(12).choice((-0.5, 0.5), WORLD.shape)
-    assert not Standstill().detect(seen(WORLD, off), MOST, at_rest=False)
+    assert not detected(Standstill(), seen(WORLD, off), at_rest=False)
     aligned = replace(seen(WORLD, off), y_opt=WORLD)
-    assert Standstill().detect(aligned, MOST, at_rest=False)
+    assert detected(Standstill(), aligned, at_rest=False)
     moves = replace(seen(WORLD, WORLD), y_opt=off)
-    assert not Standstill().detect(moves, MOST, at_rest=False)
+    assert not detected(Standstill(), moves, at_rest=False)
     some = np.where(np.arange(len(WORLD))[:, None] < 3, np.nan, WORLD)
-    assert not Standstill().detect(replace(aligned, y_opt=some), MOST, at_rest=False)
+    assert not detected(Standstill(), replace(aligned, y_opt=some), at_rest=False)
 
 
 def test_before_anything_is_known_still_features_are_more_likely_those_of_a_standstill() -> None:
     for pair, likely in ((some_move((0.1, 0.0), (0.9, 60.0)), True),
                          (some_move((0.1, 0.0), (0.3, 2 * MOST), (0.6, 60.0)), False),
                          (some_move((0.1, 0.0), (0.9, 60.0), x=WORLD[:30]), False)):
-        assert Standstill().is_likely(pair, MOST) is likely
-        assert after_a_stand().is_likely(pair, MOST)
-        moved = after_a_stand()
-        moved.moved()
-        assert not moved.is_likely(pair, MOST)
+        assert likely_stands(Standstill(), pair, at_rest=True) is likely
+
+
+def test_a_camera_that_stood_likely_stands_until_most_of_what_stood_moves_together() -> None:
+    lorry = np.random.default_rng(4).uniform((0, 0), (1240, 376), (1000, 2))
+    hides_all = seen(np.vstack([WORLD, lorry]), np.vstack([scattered(WORLD), lorry + 60 * RIGHT]))
+    for at_rest in (True, None):
+        for pair, likely in ((hides_all, True), (some_move((0.4, 0.0), (0.6, 60.0)), False),
+                             (some_move((0.6, 0.0), (0.4, 60.0)), True)):
+            assert likely_stands(after_a_stand(), pair, at_rest) is likely
+            moved = after_a_stand()
+            depart(moved)
+            assert not likely_stands(moved, pair, at_rest)
+
+
+def test_without_a_gyro_what_stood_proves_a_standstill_until_it_moves_together() -> None:
+    for still in (200, 15):
+        assert detected(after_a_stand(), behind_a_lorry(still), at_rest=None)
+    assert not detected(after_a_stand(), behind_a_lorry(3), at_rest=None)
+    assert not detected(Standstill(), behind_a_lorry(40), at_rest=None)
+    # A lorry in front of the camera drives off, or the camera does and a bonnet stays in place.
+    for share, stays in ((0.7, True), (0.3, False)):
+        below = WORLD[:, 1] > 376 * (1 - share)
+        pair = seen(WORLD, WORLD + np.where(below, 0.0, 60.0)[:, None] * RIGHT, ~below)
+        assert detected(after_a_stand(), pair, at_rest=None) is stays
+
+
+def test_what_may_be_a_bonnet_is_no_standstill_of_a_camera_that_has_not_stood() -> None:
+    """It is below the horizon; what stays in place above is not attached to the camera."""
+    for still, stands in ((WORLD[:, 1] > 260, False), (WORLD[:, 1] < 110, True)):
+        pair = seen(WORLD, WORLD + np.where(still, 0.0, 60.0)[:, None] * RIGHT, ~still)
+        before = Standstill()
+        assert detected(before, pair, at_rest=None) is stands
+        assert likely_stands(before, pair, at_rest=None) is stands
+        depart(before)
+        assert detected(before, pair, at_rest=None) is stands
+
+
+def test_what_stayed_in_place_while_the_camera_moved_is_attached_to_it() -> None:
+    bonnet = WORLD[:, 1] > 250
+    drives = seen(WORLD, WORLD + np.where(bonnet, 0.0, 60.0)[:, None] * RIGHT)
+    # Nothing but it is matched: without this memory all that is matched is still.
+    lost = seen(WORLD, np.where(bonnet[:, None], WORLD, scattered(WORLD)))
+    standstill = Standstill()
+    depart(standstill, drives)
+    assert detected(standstill, seen(WORLD, WORLD), at_rest=None)
+    standstill.stay(seen(WORLD, WORLD), MOST)
+    assert not detected(standstill, lost, at_rest=None)
+    assert detected(after_a_stand(), lost, at_rest=None)
+    # Once something moves there, nothing is attached.
+    depart(standstill)
+    standstill.stay(seen(WORLD, WORLD), MOST)
+    assert detected(standstill, lost, at_rest=None)
+
+
+def test_a_camera_that_starts_slowly_above_a_bonnet_does_not_stand() -> None:
+    """The bonnet and the most distant features are still, and others move slightly."""
+    rng, bonnet = np.random.default_rng(16), WORLD[:, 1] > 250
+    away = 0.5 / rng.uniform(0.05, 2, 400)
+    shift = np.where(bonnet, 0.0, np.where(away < MOST, 0.0, away))[:, None] * RIGHT
+    pair = seen(WORLD, WORLD + shift, ~bonnet)
+    assert not detected(after_a_stand(), pair, at_rest=None)
+    assert not likely_stands(after_a_stand(), pair, at_rest=None)
+
+
+def test_a_camera_that_vibrates_in_traffic_stands() -> None:
+    lorry = np.random.default_rng(4).uniform((0, 0), (1240, 376), (1000, 2))
+    for shift, stands in ((2 * MOST, True), (20.0, False)):
+        x = np.vstack([WORLD, lorry])
+        y = np.vstack([WORLD[:100] + shift * RIGHT, scattered(WORLD[100:]), lorry + 60 * RIGHT])
+        pair = seen(x, y, np.arange(1400) >= 400)
+        assert detected(after_a_stand(), pair, at_rest=None) is stands
+
+
+def test_a_camera_is_not_stationary_for_long_behind_what_hides_the_rest() -> None:
+    standstill, pair = after_a_stand(), behind_a_lorry(40)
+    stands = []
+    for _ in range(60):
+        stands.append(detected(standstill, pair, at_rest=None))
+        if stands[-1]:
+            standstill.stay(pair, MOST)
+    assert 20 < sum(stands) < 40
+    assert detected(standstill, pair, at_rest=True)
+
+
+def test_a_camera_that_vibrates_stood_and_one_that_turns_did_not() -> None:
+    for degrees, stood in ((0.02, True), (0.2, False)):
+        standstill = after_a_stand()
+        turn = replace(seen(WORLD, WORLD), status=Status.NO_PARALLAX,
+                       R=rotation_exp(np.radians([0, degrees, 0])))
+        depart(standstill, turn)
+        assert standstill.may_stand is stood
 
 
 CENTRE = np.array([620.0, 188.0])

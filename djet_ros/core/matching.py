@@ -114,7 +114,7 @@ def match_widely(previous: View, current: View, prior: RelativePose | None, know
     radius = search_radius * max(current.gray.shape)
     rotations = [*known.rotations(), *([] if prior is None else [prior.R])]
     rotated = predict_at_infinity(previous.features, current.features, current.K, rotations,
-                                  radius, measured=known.rotation is not None)
+                                  radius, measured=known.rotation is not None or known.stood)
     y, bits = track_features(previous, current, rotated, radius)
     pairs = _match_rotated(previous, current, rotated, prior, radius)
     y, bits = _resolved(previous, current, y, bits, pairs)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 from djet_ros.core.cells import sum_by_cell
-from djet_ros.core.geometry import chirality_signs, inverse_depths, norms, rays, unit
+from djet_ros.core.geometry import chirality_signs, inverse_depths, norms, rays, rotation_log, unit
 from djet_ros.core.jet import clipped_scale, JetProblem, Loss, robust_scale
 from djet_ros.core.sketch import losses_in_front, refine_all, Sketch
 from djet_ros.core.starts import starts_around, subsampled
@@ -64,6 +64,12 @@ DEEP_RATIO = 0.25
 
 # chosen: noise of an inverse depth over the near end; above, noise would make a plane look deep.
 _MAX_DEPTH_NOISE = 0.1
+
+
+# chosen: a match that moves by less than this multiple of what counts as still moves slightly; and
+# the share of such matches, of those that are still, beside a camera that stands. It was below a
+# tenth there, and above 0.9 beside one that moves.
+_SLIGHTLY, _MAX_SLIGHTLY = 3.0, 0.25
 
 
 @dataclass(frozen=True)
@@ -294,6 +300,31 @@ def motion_without_attached(problem: JetProblem, fixed: NDArray[np.bool_], pose:
     deep = _flatness(moving.subset(agree), motion) < DEEP_RATIO
     continued = prior is not None and continues_motion(prior, motion, pose)
     return motion if deep or continued else None
+
+
+def may_stand(problem: JetProblem, shift: Array, pose: Pose, focal: float, noise: float,
+              least: int, prior: Pose | None) -> bool:
+    """
+    Return whether the camera may stand still while a body that fills most of the image passes.
+
+    The motion of the body fits what stands still too, as infinitely far. But if a camera moves
+    without rotation, not only the sky hardly moves: more points are so far that they move
+    slightly. The static world also has depths from near to far. A motion that continues the
+    previous one is the camera's.
+
+    problem: all matches; shift: (N,) their displacements; focal: focal length; noise: robust
+    standard deviation of the matches; all in pixels; least: minimum number of matches that stand
+    still; prior: the previous motion.
+    """
+    still, slightly = OUTLIER * noise, _SLIGHTLY * OUTLIER * noise
+    standing, moving = (shift < still).sum(), shift > slightly
+    between = len(shift) - standing - moving.sum()
+    if (focal * np.linalg.norm(rotation_log(pose.R)) > slightly or standing < least
+            or between >= _MAX_SLIGHTLY * standing
+            or (prior is not None and pose_distance(prior, pose) < _MAX_CHANGE)):
+        return False
+    agree = _distances(problem, refine_all(problem, [pose], Loss(), 0)) < INLIER * noise
+    return not _flatness(problem.subset(np.flatnonzero(agree & moving)), pose) < DEEP_RATIO
 
 
 def false_alarms(agreeing: int, matches: int, chance: float) -> float:

@@ -69,18 +69,21 @@ def starting_poses(K: Array, x: Array, y: Array, threshold: float,
 @dataclass(frozen=True)
 class KnownMotion:
     """
-    Measurements of a motion from other sources than the images.
+    Knowledge of a motion from other sources than the two images.
 
     rotation: its rotation with covariance, as from a gyro; guess: an approximate pose, as from
-    another odometry.
+    another odometry; stood: whether the camera stood still before. What stays in place is then
+    the static world, and not attached to the camera.
     """
 
     rotation: MeasuredRotation | None = None
     guess: Pose | None = None
+    stood: bool = False
 
     def rotations(self) -> list[Array]:
-        """Return the measured rotations, (3, 3) each, the most certain first."""
-        return [one.R for one in (self.rotation, self.guess) if one is not None]
+        """Return the known rotations, (3, 3) each, the most certain first."""
+        known = [one.R for one in (self.rotation, self.guess) if one is not None]
+        return [*known, np.eye(3)] if self.stood else known
 
 
 def external_starts(K: Array, x: Array, y: Array, known: KnownMotion) -> list[Pose]:

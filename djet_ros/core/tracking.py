@@ -174,6 +174,8 @@ def _attached_to_camera(algorithm: Algorithm, track: Track, noise: float
                         ) -> NDArray[np.bool_] | None:
     """Return the matches (N,) on what moves with the camera, None if there are none."""
     pair, first, measured = algorithm.pair, algorithm.first, algorithm.pair.known.rotation
+    if pair.known.stood:
+        return None
     fixed = norms(pair.y - pair.x) < ALGORITHM_TUNING.inlier * noise
     world = motion_without_attached(first.problem, fixed[first.voting], track.pose, noise,
                                     algorithm.config.min_matches, pair.prior)

@@ -36,6 +36,7 @@ from djet_ros.core.patches import unaligned
 from djet_ros.core.rivals import (
     continues_motion,
     false_alarms,
+    may_stand,
     pose_distance,
     preferences,
     SIGNIFICANT_PREFERENCE,
@@ -99,6 +100,8 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
     else:
         status, covariance, rivals = _compare_with_rivals(
             pose, covariance, track, pair.x, pair.prior, sign_open)
+        if status is Status.OK and _may_stand(pair, track, pose, config.min_matches):
+            status, covariance = Status.TWO_MOTIONS, _of_any_direction(covariance)
     determined = bool(np.isfinite(covariance).all())
     if config.calibration_sigma and determined:
         calibration = calibration_covariance(
@@ -260,10 +263,24 @@ def _compare_with_rivals(pose: Pose, covariance: Array, track: Track, x: Array,
         covariance = widened(covariance, pose.t, _covariance_of(rival.pose, track, x))
     if sign_open:
         status = status if track.body_ambiguous else Status.AMBIGUOUS
-        # The arc to -t is pi, in no particular tangent direction.
-        for offset in np.pi / np.sqrt(2) * np.eye(5)[3:]:
-            covariance = widened_to_span(covariance, offset, 0.5)
+        covariance = _of_any_direction(covariance)
     return status, covariance, possible
+
+
+def _of_any_direction(covariance: Array) -> Array:
+    """Widen a covariance (5, 5) to span the opposite direction, in no particular tangent."""
+    for offset in np.pi / np.sqrt(2) * np.eye(5)[3:]:
+        covariance = widened_to_span(covariance, offset, 0.5)
+    return covariance
+
+
+def _may_stand(pair: Pair, track: Track, pose: Pose, least: int) -> bool:
+    """Return whether the camera of a pair may stand still; see ``rivals.may_stand``."""
+    if pair.known.rotation is not None:
+        return False
+    shift = norms(track.minima - pair.x).compress(track.voting)
+    return may_stand(track.problem, shift, pose, float(pair.current.K[0, 0]),
+                     track.surface_noise, least, pair.prior)
 
 
 def _covariance_of(pose: Pose, track: Track, x: Array) -> Array:

@@ -10,7 +10,7 @@ Navigation, section 5.4). So a share q of all poses must be inside the ellipsoid
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -51,7 +51,8 @@ class Coverage:
 
     scene: without its seed; start: ALONE or IN_A_ROW; previous, current: indices of the frames;
     errors and standard deviations ('claim') in degrees, NaN if there is none; square: e^T C^-1 e;
-    failed: see ``pairs.FAILURE``, of the best estimate if no pose was accepted.
+    failed: see ``pairs.FAILURE``, of the best estimate if no pose was accepted; stood: whether the
+    camera did not move at all.
     """
 
     scene: str
@@ -68,6 +69,7 @@ class Coverage:
     square: float
     matches: int
     inliers: int
+    stood: bool = False
 
     @property
     def has_nees(self) -> bool:
@@ -80,15 +82,26 @@ class Coverage:
         return self.status in (s.value for s in TRACKED) and not self.has_nees and self.failed
 
     @property
-    def overconfident(self) -> bool:
-        """Return whether the pose failed with small standard deviations."""
-        return (self.has_nees and self.failed and self.rotation_claim_deg < SURE_ROTATION
+    def invented(self) -> bool:
+        """Return whether the pose has a direction of motion, although the camera stood still."""
+        return (self.stood and self.status == Status.OK.value
                 and self.direction_claim_deg < SURE_DIRECTION)
 
     @property
+    def overconfident(self) -> bool:
+        """Return whether the pose failed with small standard deviations."""
+        wrong = self.has_nees and self.failed and self.direction_claim_deg < SURE_DIRECTION
+        return (wrong or self.invented) and self.rotation_claim_deg < SURE_ROTATION
+
+    @property
     def rejected_correct(self) -> bool:
-        """Return whether no pose was accepted, although the best estimate was correct."""
-        return self.status not in (s.value for s in TRACKED) and not self.failed
+        """
+        Return whether no pose was accepted, although the best estimate was correct.
+
+        That of a camera that stands still has no direction to be correct in.
+        """
+        return (self.status not in (s.value for s in TRACKED)
+                and not self.failed and not self.stood)
 
 
 @dataclass(frozen=True)
@@ -96,12 +109,12 @@ class CoverageRow:
     """
     Summary of the pairs of one scene and start.
 
-    told: pairs with a NEES; failed, wrong_and_sure: failed and overconfident ones among these;
-    untold: tracked without a direction, see ``Coverage.missed_direction``; given_up: without a
-    pose, needlessly: of these, with a correct best estimate; median: of the NEES, over the median
-    of its distribution; inside: by LEVELS, the share of these pairs inside the ellipsoid, with its
-    95 % confidence interval (Clopper and Pearson, Biometrika 1934). Each failed pair is counted
-    in one of failed, untold and given_up.
+    told: pairs with a NEES; failed, wrong_and_sure: failed and overconfident ones among these and
+    among the ``Coverage.invented``; untold: tracked without a direction, see
+    ``Coverage.missed_direction``; given_up: without a pose, needlessly: of these, with a correct
+    best estimate; median: of the NEES, over the median of its distribution; inside: by LEVELS, the
+    share of these pairs inside the ellipsoid, with its 95 % confidence interval (Clopper and
+    Pearson, Biometrika 1934). Each failed pair is counted in one of failed, untold and given_up.
     """
 
     scene: str
@@ -143,7 +156,10 @@ def _in_a_row(chunk: PairChunk, config: EstimatorConfig) -> Iterator[Coverage]:
         result = odometry.process(sequence.frame(current))
         if number > chunk.first and result.relative and result.previous_stamp_ns is not None:
             previous = int(np.searchsorted(stamps, result.previous_stamp_ns))
-            yield from _covered(chunk, IN_A_ROW, previous, current, result.relative)
+            pair = result.relative
+            if result.stationary:
+                pair = replace(pair, status=result.status, R=np.eye(3), t=np.zeros(3))
+            yield from _covered(chunk, IN_A_ROW, previous, current, pair)
 
 
 def _covered(chunk: PairChunk, start: str, previous: int, current: int,
@@ -166,7 +182,7 @@ def _covered(chunk: PairChunk, start: str, previous: int, current: int,
         pose.status.value, has_failed(rotation, direction, true_motion), rotation, direction,
         float(claims[0]), float(claims[1]),
         normalised_square(pose, true_motion) if np.isfinite(direction) else float('nan'),
-        len(pose.x), int(pose.inliers.sum()))
+        len(pose.x), int(pose.inliers.sum()), bool(np.allclose(true_motion, np.eye(4))))
 
 
 def _scene(dataset: Dataset) -> str:
@@ -199,7 +215,7 @@ def _row(scene: str, start: str, records: Sequence[Coverage]) -> CoverageRow:
     tracked = [status.value for status in TRACKED]
     return CoverageRow(
         scene, start, len(records), len(squares),
-        sum(record.failed for record in records if record.has_nees),
+        sum((record.failed and record.has_nees) or record.invented for record in records),
         sum(record.missed_direction for record in records),
         sum(record.status not in tracked for record in records),
         sum(record.rejected_correct for record in records),

@@ -177,15 +177,17 @@ class Gyro:
         self.bias_covariance = keep @ P @ keep.T + gain @ noise @ gain.T
         self._bias_ns = end_ns
 
-    def at_rest(self, start_ns: int, end_ns: int) -> bool:
-        """Return whether the rotation between two images is insignificant, and well measured."""
+    def at_rest(self, start_ns: int, end_ns: int) -> bool | None:
+        """Return whether the rotation between two images is insignificant, if well measured."""
         turn, integral = self.turn(start_ns, end_ns), self._integral(start_ns, end_ns)
         if turn is None or integral is None or integral.samples < _EQUAL_IN_A_ROW:
-            return False
+            return None
         sigma = float(np.sqrt(np.linalg.eigvalsh(turn.covariance)[-1]))
+        if sigma >= _SIGMA_AT_REST:
+            return None
         white = self.noise.density * np.sqrt(integral.samples / integral.seconds)
         angle = float(np.linalg.norm(turn.correction(np.eye(3))))
-        return bool(sigma < _SIGMA_AT_REST and angle < _AT_REST * sigma
+        return bool(angle < _AT_REST * sigma
                     and (integral.spread < _NOISE_AT_REST * white).all())
 
     def judge(self, agreed: bool) -> None:

@@ -59,9 +59,9 @@ class MotionPriors:
         """Return the rotation that the gyro measured, if it did."""
         return None if self.gyro is None else self.gyro.turn(*span_ns)
 
-    def at_rest(self, span_ns: Span) -> bool:
-        """Return whether a gyro measured no rotation since the last known motion."""
-        return self.gyro is not None and self.gyro.at_rest(
+    def at_rest(self, span_ns: Span) -> bool | None:
+        """Return whether a gyro measured no rotation since the last known motion, if it did."""
+        return None if self.gyro is None else self.gyro.at_rest(
             max(span_ns[0], self.known_ns), span_ns[1])
 
     def may_mislead(self, relative: RelativePose) -> bool:

@@ -1,28 +1,36 @@
-"""Standstill detection: no match moves, or only other objects do while a gyro is at rest."""
+"""Standstill detection: no match moves, or only those of other objects do."""
 
 from __future__ import annotations
 
 from djet_ros.core.geometry import norms
 from djet_ros.core.types import Array, RelativePose, Status, TRACKED
+from djet_ros.odometry.displacement import cell_of, cells, Displaced, drifted, identifiers, turns
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fdtrc
 
-# Cell size in pixels, and least share of the matches, and of the cells with matches, that are
-# still if the camera stands in front of traffic; chosen: the share if it stood before or if that
-# is unknown, as most cameras stand at first.
-_CELL, _STILL, _STILL_AS_BEFORE = 32, 0.2, 0.05
+# chosen: least share of the matches, and of the cells with matches, that are still if the camera
+# stands in front of traffic; with a gyro at rest also the share if it stood before or if that is
+# unknown, as most cameras stand at first.
+_STILL, _STILL_AS_BEFORE = 0.2, 0.05
 
-# A match moves slightly if its displacement is below this multiple of the standstill threshold.
-_SLIGHTLY = 3
-
-# chosen: share of the standstill threshold from which a common drift is creep, and the
-# significance that it needs.
-_CREEP, _SIGNIFICANCE = 0.1, 1e-3
+# chosen: share of the standstill threshold from which a common drift is creep.
+_CREEP = 0.1
 
 # chosen: least number of still features that stood before. False matches of a thousand features
 # end within a third of a pixel of where they began less than once in a hundred pairs.
 _LEAST_STILL = 10
+
+# chosen: least share of features with another place that move together if the camera does; a
+# thirtieth of false matches does.
+_TOGETHER = 0.25
+
+# chosen: least number of features that move slightly if a camera that does not turn has moved, as
+# a share of those that are still and of all that stood before: false matches are few of these.
+_SLIGHTLY_IF_MOVED, _SLIGHTLY_OF_ALL = 0.25, 0.15
+
+# chosen: number of pairs in a row in which lorries may hide most of what stood still. After more,
+# the camera may have left unnoticed, with a bonnet that stays in place.
+_LONGEST_HIDDEN = 30
 
 
 class Standstill:
@@ -35,49 +43,116 @@ class Standstill:
 
     def __init__(self) -> None:
         self._stood: bool | None = None
-        self._static = np.empty(0, np.complex128)
+        # Cells of the image in which nothing moved while the camera did.
+        self._attached = np.empty(0, np.complex128)
+        self.refer()
 
     def refer(self) -> None:
         """Begin with another reference view, without known static features."""
         self._static = np.empty(0, np.complex128)
-
-    def moved(self) -> None:
-        """Note that the camera moved."""
-        self._stood = False
+        # The most matches that were still, and pairs in a row in which half of them were not.
+        self._most = self._hidden = 0
 
     def stay(self, relative: RelativePose, threshold: float) -> None:
         """Note that the camera stood still in a pair, and which features did."""
         self._stood = True
-        features = _identifiers(relative.x)
-        still = _displacements(relative.x, relative.y) < threshold
+        features = identifiers(relative.x)
+        still = Displaced.of(relative, threshold).still
         self._static = np.union1d(np.setdiff1d(self._static, features), features[still])
+        self._most = max(self._most, int(still.sum()))
+        self._hidden = 0 if 2 * still.sum() >= self._most else self._hidden + 1
 
-    def detect(self, relative: RelativePose, threshold: float, at_rest: bool) -> bool:
+    def detect(self, relative: RelativePose, threshold: float, at_rest: bool | None,
+               horizon: float) -> bool:
         """
         Return whether the camera stands still in a pair.
 
-        at_rest: whether a gyro measured no rotation.
+        at_rest: whether a gyro measured no rotation; None without a gyro. Then what stays in place
+        may be a bonnet that moves with the camera, so it has to have stood before, or be above the
+        horizon, a row of pixels.
         """
-        if not len(relative.x):
+        if not len(relative.x) or (not at_rest and self._hidden > _LONGEST_HIDDEN):
             return False
-        if _nothing_moves(relative, threshold):
+        if _nothing_moves(relative, self._is_apart(relative.x), threshold):
             return True
-        if not at_rest:
+        matches = self._matches(relative, threshold)
+        if at_rest is False or (at_rest is None and self._static_features_move(matches, None)):
             return False
-        still, slightly = _still_and_slightly(relative, threshold)
-        return (self._only_others_move(relative, still, slightly)
-                or self._static_features_are_still(relative, still, slightly))
+        return (self._only_others_move(_world(matches, at_rest, horizon), bool(at_rest))
+                or self._static_features_are_still(matches, at_rest))
 
-    def is_likely(self, relative: RelativePose, threshold: float) -> bool:
-        """
-        Return whether a camera with a gyro at rest is more likely to stand than to have started.
+    def _matches(self, relative: RelativePose, threshold: float) -> Displaced:
+        """Return the matches that are not on what is attached to the camera."""
+        return Displaced.of(relative, threshold).among(self._is_apart(relative.x))
 
-        It is if it stood before; if that is unknown, enough matches have to be still.
+    def _is_apart(self, x: Array) -> NDArray[np.bool_]:
+        """Return which pixels (N, 2) are not on what is attached to the camera, nor just above."""
+        cell = cell_of(x)
+        attached = np.isin(identifiers(np.stack([cell, cell + np.array([0, 1])])), self._attached)
+        return np.asarray(~attached.any(0))
+
+    def take(self, relative: RelativePose, K: Array, threshold: float) -> None:
         """
-        if self._stood is not None:
-            return self._stood
-        still, slightly = _still_and_slightly(relative, threshold)
-        return bool(still.sum() >= max(_LEAST_STILL, slightly.sum()))
+        Note a pair that is no standstill: the camera moved, unless it only vibrated.
+
+        What stays in place below the horizon is attached to it, until something moves there.
+        """
+        if relative.status is not Status.OK:
+            if turns(relative, K, threshold):
+                self._stood = False
+            return
+        self._stood = False
+        below = Displaced.of(relative, threshold).among(relative.x[:, 1] > K[1, 2])
+        moved, still = (np.unique(identifiers(cell_of(below.x[where])))
+                        for where in (~below.still, below.still))
+        self._attached = np.setdiff1d(np.union1d(self._attached, still), moved)
+
+    @property
+    def may_stand(self) -> bool:
+        """Return whether the camera stood still before, or may have, as most do at first."""
+        return self._stood is not False
+
+    def _static_features_move(self, matches: Displaced, at_rest: bool | None) -> bool:
+        """
+        Return whether static features move in more of the image than they stand still in.
+
+        So they do if the camera starts: a body that starts is smaller than all else, and so is a
+        bonnet that moves with the camera. What a lorry hides has false matches, few of which move
+        together or slightly. If the camera starts slowly, many move slightly.
+        """
+        static = self._static_among(matches, at_rest)
+        still, slightly = static.still, static.slightly
+        if slightly.sum() >= max(_LEAST_STILL, _SLIGHTLY_OF_ALL * len(static.x),
+                                 _SLIGHTLY_IF_MOVED * still.sum()):
+            return True
+        moving = static.among(~still & ~slightly)
+        together = moving.together()
+        return bool(len(together) >= max(_LEAST_STILL, _TOGETHER * len(moving.x))
+                    and len(cells(together)) > len(cells(static.x[still])))
+
+    def _static_among(self, matches: Displaced, at_rest: bool | None) -> Displaced:
+        """
+        Return the static features of some matches; if most others move, without a common drift.
+
+        A car that waits in traffic vibrates, unless a gyro is at rest.
+        """
+        static = matches.among(np.isin(identifiers(matches.x), self._static))
+        vibrates = not at_rest and matches.near.sum() < len(matches.x) / 2
+        return static.without_drift() if vibrates else static
+
+    def is_likely(self, relative: RelativePose, threshold: float, at_rest: bool | None,
+                  horizon: float) -> bool:
+        """
+        Return whether a camera that does not rotate more likely stands than has started to move.
+
+        It does if it stood before, unless static features move in most of the image; if that is
+        unknown, enough matches have to be still. at_rest, horizon: as for ``detect``.
+        """
+        matches = self._matches(relative, threshold)
+        if self._stood is None:
+            world = _world(matches, at_rest, horizon)
+            return bool(world.still.sum() >= max(_LEAST_STILL, world.slightly.sum()))
+        return self._stood and not self._static_features_move(matches, at_rest)
 
     def creeps(self, relative: RelativePose, threshold: float) -> bool:
         """
@@ -86,26 +161,28 @@ class Standstill:
         The threshold also excludes the matches of other objects that move.
         """
         y = _refined(relative)
-        still = _displacements(relative.x, y) < threshold
-        return _drifted(relative.x[still], y[still], _CREEP * threshold)
+        still = norms(y - relative.x) < threshold
+        return drifted(relative.x[still], y[still], _CREEP * threshold)
 
-    def _only_others_move(self, relative: RelativePose, still: NDArray[np.bool_],
-                          slightly: NDArray[np.bool_]) -> bool:
+    def _only_others_move(self, matches: Displaced, at_rest: bool) -> bool:
         """
         Return whether a sufficient share of the matches, all over the image, is still.
 
-        A smaller share is sufficient if the camera stood before. If the camera moves, few matches
-        are still and more move slightly; if it stands, matches move or do not. Slow motion is
-        taken for a standstill only for a short time, as displacements from the same reference view
-        accumulate.
+        A smaller share is sufficient if the camera stood before and a gyro is at rest. If the
+        camera moves, few matches are still and others move slightly; if it stands, matches move or
+        do not. Slow motion is taken for a standstill only for a short time, as displacements from
+        the same reference view accumulate.
         """
-        cells = np.floor_divide(relative.x, _CELL)
-        spread = len(np.unique(cells[still], axis=0)) / len(np.unique(cells, axis=0))
-        least = _STILL if self._stood is False else _STILL_AS_BEFORE
-        return bool(still.mean() > least and spread > least and still.sum() > slightly.sum())
+        still = matches.still
+        if still.sum() < _LEAST_STILL:
+            return False
+        spread = len(cells(matches.x[still])) / len(cells(matches.x))
+        least = _STILL_AS_BEFORE if at_rest and self._stood is not False else _STILL
+        slightly = 1.0 if at_rest else _SLIGHTLY_IF_MOVED
+        return bool(still.mean() > least and spread > least
+                    and matches.slightly.sum() < slightly * still.sum())
 
-    def _static_features_are_still(self, relative: RelativePose, still: NDArray[np.bool_],
-                                   slightly: NDArray[np.bool_]) -> bool:
+    def _static_features_are_still(self, matches: Displaced, at_rest: bool | None) -> bool:
         """
         Return whether static features are still, however few of them a lorry leaves visible.
 
@@ -113,56 +190,29 @@ class Standstill:
         moved, all but the most distant static features would move slightly, or be inliers of the
         pair's motion; so more have to be still than do either.
         """
-        static = np.isin(_identifiers(relative.x), self._static)
-        moving = np.zeros(len(static), bool)
-        if len(relative.inliers):
-            moving = relative.inliers & ~still
-        standing = (static & still).sum()
-        return bool(standing >= _LEAST_STILL and standing > (static & slightly).sum()
-                    and standing > (static & moving).sum())
+        static = self._static_among(matches, at_rest)
+        standing = static.still.sum()
+        return bool(standing >= _LEAST_STILL and standing > static.slightly.sum()
+                    and standing > (static.inliers & ~static.still).sum())
 
 
-def _nothing_moves(relative: RelativePose, threshold: float) -> bool:
+def _world(matches: Displaced, at_rest: bool | None, horizon: float) -> Displaced:
+    """Return the matches that are not on a bonnet if they are still: all, if a gyro is at rest."""
+    return matches if at_rest else matches.among(matches.x[:, 1] < horizon)
+
+
+def _nothing_moves(relative: RelativePose, apart: NDArray[np.bool_], threshold: float) -> bool:
+    """Return whether most matches (N,), of those apart from the camera, are still."""
     # Most methods report two equal images as DEGENERATE, as all residuals are zero.
-    if relative.status not in (*TRACKED, Status.DEGENERATE):
+    if relative.status not in (*TRACKED, Status.DEGENERATE) or not apart.any():
         return False
-    return float(np.median(_displacements(relative.x, _refined(relative)))) < threshold
+    x, y = relative.x[apart], _refined(relative)[apart]
+    still = norms(y - x) < threshold
+    # In most of the image too, as a bonnet may have most of the features.
+    return bool(still.mean() > 0.5 and len(cells(x[still])) > len(cells(x)) / 2)
 
 
 def _refined(relative: RelativePose) -> Array:
     """Return the matched pixels (N, 2), refined if all of them are."""
     refined = len(relative.y_opt) == len(relative.x) and np.isfinite(relative.y_opt).all()
     return relative.y_opt if refined else relative.y
-
-
-def _drifted(x: Array, y: Array, least: float) -> bool:
-    """
-    Return whether pixels x have a common drift to y (N, 2), above a root mean square.
-
-    Common: by an affine map, whose six parameters also fit their share of the noise; that is
-    subtracted, and an F-test has to reject no drift. Too few pixels have none.
-    """
-    freedom = 2 * len(x) - 6
-    if freedom <= 0:
-        return False
-    design = np.column_stack([x, np.ones(len(x))])
-    fit = design @ np.linalg.lstsq(design, y - x, rcond=None)[0]
-    drift, noise = float((fit**2).sum()), float(((y - x - fit)**2).sum()) / freedom
-    return bool(drift - 6 * noise > len(x) * least**2
-                and fdtrc(6, freedom, drift / max(6 * noise, 1e-12)) < _SIGNIFICANCE)
-
-
-def _still_and_slightly(relative: RelativePose, threshold: float
-                        ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return masks (N,) of the matches that are still, and of those that move slightly."""
-    shift = _displacements(relative.x, relative.y)
-    return shift < threshold, (shift >= threshold) & (shift < _SLIGHTLY * threshold)
-
-
-def _displacements(x: Array, y: Array) -> Array:
-    return norms(y - x)
-
-
-def _identifiers(x: Array) -> NDArray[np.complex128]:
-    """Return pixels (N, 2) as one number each, to compare sets of them."""
-    return np.asarray(x[:, 0] + 1j * x[:, 1], np.complex128)

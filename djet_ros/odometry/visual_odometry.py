@@ -23,6 +23,7 @@ from djet_ros.core.types import (
     View,
 )
 from djet_ros.core.verdict import as_decided
+from djet_ros.odometry.displacement import turns
 from djet_ros.odometry.frame import continuity, Frame, Reference
 from djet_ros.odometry.guess import Guess
 from djet_ros.odometry.inertial import Gyro
@@ -157,25 +158,49 @@ class VisualOdometry:
             view = frame.view(self._estimator)
         if status is not Status.OK:
             return self._started(frame, view, status, backwards)
-        # Estimate the relative pose: the last motion and the priors are among the initial poses.
+        # Estimate the relative pose; first as if the camera stood still, if it may have until now.
         reference = self._reference
         span = reference.since_ns, frame.stamp_ns
-        priors = self._priors.of(span)
-        pair = self._estimator.estimate(reference.view, view, self._last_pair, priors)
-        # If several motions are possible, the pair before may decide.
-        if pair.rivals and pair.status in (Status.OK, Status.AMBIGUOUS):
-            pair = self._decided(view, pair, priors)
+        priors, at_rest = self._priors.of(span), self._priors.at_rest(span)
+        standing = self._standing(view, priors, at_rest)
+        stands = standing is not None and self._stands(standing, at_rest)
+        pair = standing if standing is not None and stands else self._estimated(view, priors)
         self._scale_source.observe(*span, reference.view, view, pair)
         # Detect a standstill.
-        at_rest = self._priors.at_rest(span)
-        if self._standstill.detect(pair, self._config.standstill, at_rest):
+        if stands or self._stands(pair, at_rest):
             return self._stationary(frame, pair, span)
         # Verify the pair by the landmarks' depths and the gyro, and fuse the gyro's rotation.
         pair = self._verified(view, pair, priors, span)
+        if self._is_doubtful(pair, standing or pair, span):
+            pair = ambiguous(pair)
         if pair.status not in TRACKED:
             return self._lost(frame, view, pair, span)
         # Estimate the length of its translation, and integrate it.
         return self._tracked(frame, view, pair, span)
+
+    def _standing(self, view: View, priors: KnownMotion, at_rest: bool | None
+                  ) -> RelativePose | None:
+        """Return the pair of a camera that stands still; None if it moved before or turned."""
+        if not self._standstill.may_stand or at_rest is False:
+            return None
+        return self._estimator.estimate(self._reference.view, view, None,
+                                        replace(priors, stood=True))
+
+    def _estimated(self, view: View, priors: KnownMotion) -> RelativePose:
+        """Return the pair; the last motion and the priors are among the initial poses."""
+        pair = self._estimator.estimate(self._reference.view, view, self._last_pair, priors)
+        # If several motions are possible, the pair before may decide.
+        if pair.rivals and pair.status in (Status.OK, Status.AMBIGUOUS):
+            return self._decided(view, pair, priors)
+        return pair
+
+    def _stands(self, pair: RelativePose, at_rest: bool | None) -> bool:
+        return self._standstill.detect(pair, self._config.standstill, at_rest, self._horizon)
+
+    @property
+    def _horizon(self) -> float:
+        """Return the row of pixels of what is as high as a level camera."""
+        return float(self._reference.view.K[1, 2])
 
     def _decided(self, view: View, pair: RelativePose, priors: KnownMotion) -> RelativePose:
         """Return the pair with the motion that is consistent with the pair before it, if any."""
@@ -205,14 +230,24 @@ class VisualOdometry:
                 self._priors.judge(priors.rotation, alone)
         pair = self._scale.verified(pair, self._reference.view.K)
         # What bridges bad pairs may be the motion of what made them bad: it calibrates no gyro.
-        pair = self._priors.fuse(pair, priors.rotation, span, learn=not self._bad_pairs)
-        # After a standstill without any rotation, something that fills the image may move. Most
-        # cameras turn a little as they start; one on a rail may not, and is trusted after a while.
-        doubtful = (pair.status is Status.OK
-                    and span[1] - self._priors.known_ns < _UNMEASURED_START_NS
-                    and self._standstill.is_likely(pair, self._config.standstill)
-                    and self._priors.at_rest(span))
-        return ambiguous(pair) if doubtful else pair
+        return self._priors.fuse(pair, priors.rotation, span, learn=not self._bad_pairs)
+
+    def _is_doubtful(self, pair: RelativePose, standing: RelativePose, span: Span) -> bool:
+        """
+        Return whether something that fills the image may move past a camera that stands still.
+
+        standing: the pair if the camera stands, with the matches that then stay in place.
+
+        Most cameras turn a little as they start; one on a rail may not, and is trusted after a
+        while.
+        """
+        at_rest = self._priors.at_rest(span)
+        turned = (turns(pair, self._reference.view.K, self._config.standstill)
+                  if at_rest is None else not at_rest)
+        return (not turned and pair.status is Status.OK
+                and span[1] - self._priors.known_ns < _UNMEASURED_START_NS
+                and self._standstill.is_likely(standing, self._config.standstill, at_rest,
+                                               self._horizon))
 
     def _started(self, frame: Frame, view: View, status: Status,
                  backwards: bool) -> OdometryResult:
@@ -288,7 +323,7 @@ class VisualOdometry:
             self._trajectory = trajectory
             self._refer_to(frame, view, pair)
         self._last_pair, self._bad_pairs, self._priors.known_ns = pair, 0, frame.stamp_ns
-        self._standstill.moved()
+        self._standstill.take(pair, view.K, self._config.standstill)
         if (k1 := self._scale.k1_due) is not None:
             self._undistort(k1)
         return result
