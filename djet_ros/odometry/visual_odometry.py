@@ -163,11 +163,13 @@ class VisualOdometry:
         span = reference.since_ns, frame.stamp_ns
         priors, at_rest = self._priors.of(span), self._priors.at_rest(span)
         standing = self._standing(view, priors, at_rest)
-        stands = standing is not None and self._stands(standing, at_rest)
-        pair = standing if standing is not None and stands else self._estimated(view, priors)
+        if standing is not None and self._stands(standing, at_rest):
+            pair, stands = standing, True
+        else:
+            pair = self._estimated(view, priors)
+            stands = self._stands(pair, at_rest)
         self._scale_source.observe(*span, reference.view, view, pair)
-        # Detect a standstill.
-        if stands or self._stands(pair, at_rest):
+        if stands:
             return self._stationary(frame, pair, span)
         # Verify the pair by the landmarks' depths and the gyro, and fuse the gyro's rotation.
         pair = self._verified(view, pair, priors, span)
@@ -236,10 +238,8 @@ class VisualOdometry:
         """
         Return whether something that fills the image may move past a camera that stands still.
 
-        standing: the pair if the camera stands, with the matches that then stay in place.
-
         Most cameras turn a little as they start; one on a rail may not, and is trusted after a
-        while.
+        while. standing: the pair as of a camera that stands, with all matches that stay in place.
         """
         at_rest = self._priors.at_rest(span)
         turned = (turns(pair, self._reference.view.K, self._config.standstill)
