@@ -263,6 +263,22 @@ def test_a_camera_is_not_stationary_for_long_behind_what_hides_the_rest() -> Non
     assert detected(standstill, pair, at_rest=True)
 
 
+def test_a_standstill_is_the_previous_motion_of_the_next_pair_unless_much_moves() -> None:
+    standstill = Standstill()
+    assert standstill.prior is None
+    standstill.stay(some_move((0.95, 0.05), (0.05, 60.0)), MOST)
+    prior = standstill.prior
+    assert prior is not None
+    assert not prior.t.any() and np.array_equal(prior.R, np.eye(3))
+    assert np.array_equal(prior.y_opt, prior.x)
+    assert prior.inliers.mean() == pytest.approx(0.95, abs=0.03)
+    standstill.stay(some_move((0.7, 0.05), (0.3, 60.0)), MOST)
+    assert standstill.prior is None
+    standstill.stay(seen(WORLD, WORLD), MOST)
+    standstill.refer()
+    assert standstill.prior is None
+
+
 def test_a_camera_that_vibrates_stood_and_one_that_turns_did_not() -> None:
     for degrees, stood in ((0.02, True), (0.2, False)):
         standstill = after_a_stand()

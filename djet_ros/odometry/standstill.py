@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from djet_ros.core.geometry import norms
 from djet_ros.core.types import Array, RelativePose, Status, TRACKED
 from djet_ros.odometry.displacement import cell_of, cells, Displaced, drifted, identifiers, turns
@@ -28,6 +30,9 @@ _TOGETHER = 0.25
 # a share of those that are still and of all that stood before: false matches are few of these.
 _SLIGHTLY_IF_MOVED, _SLIGHTLY_OF_ALL = 0.25, 0.15
 
+# chosen: share of still matches from which what stood is searched near its place.
+_STATIC = 0.9
+
 # chosen: number of pairs in a row in which lorries may hide most of what stood still. After more,
 # the camera may have left unnoticed, with a bonnet that stays in place.
 _LONGEST_HIDDEN = 30
@@ -39,6 +44,9 @@ class Standstill:
 
     Remembers features of the reference view that were still while the camera stood, identified by
     their pixels. A match is still if its displacement in pixels is below the threshold.
+
+    prior: the standstill as the previous motion, from the reference view; None if there is none,
+    or if much moves.
     """
 
     def __init__(self) -> None:
@@ -50,6 +58,7 @@ class Standstill:
     def refer(self) -> None:
         """Begin with another reference view, without known static features."""
         self._static = np.empty(0, np.complex128)
+        self.prior: RelativePose | None = None
         # The most matches that were still, and pairs in a row in which half of them were not.
         self._most = self._hidden = 0
 
@@ -59,6 +68,7 @@ class Standstill:
         features = identifiers(relative.x)
         still = Displaced.of(relative, threshold).still
         self._static = np.union1d(np.setdiff1d(self._static, features), features[still])
+        self.prior = _in_place(relative, still) if still.mean() > _STATIC else None
         self._most = max(self._most, int(still.sum()))
         self._hidden = 0 if 2 * still.sum() >= self._most else self._hidden + 1
 
@@ -194,6 +204,13 @@ class Standstill:
         standing = static.still.sum()
         return bool(standing >= _LEAST_STILL and standing > static.slightly.sum()
                     and standing > (static.inliers & ~static.still).sum())
+
+
+def _in_place(relative: RelativePose, still: NDArray[np.bool_]) -> RelativePose:
+    """Return a pair as that of a camera that stands, whose inliers stay in place."""
+    return replace(relative, status=Status.NO_PARALLAX, R=np.eye(3), t=np.zeros(3), rivals=(),
+                   y=relative.x, y_opt=relative.x, inliers=still, left_out=None,
+                   residuals=norms(relative.y - relative.x))
 
 
 def _world(matches: Displaced, at_rest: bool | None, horizon: float) -> Displaced:

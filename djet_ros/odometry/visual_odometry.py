@@ -185,7 +185,7 @@ class VisualOdometry:
         """Return the pair of a camera that stands still; None if it moved before or turned."""
         if not self._standstill.may_stand or at_rest is False:
             return None
-        return self._estimator.estimate(self._reference.view, view, None,
+        return self._estimator.estimate(self._reference.view, view, self._standstill.prior,
                                         replace(priors, stood=True))
 
     def _estimated(self, view: View, priors: KnownMotion) -> RelativePose:
