@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 from subprocess import CompletedProcess
 from types import ModuleType
+import warnings
 
 import commands
 from djet_ros.core.covariance import pose_difference, widened_to_span
@@ -16,6 +17,7 @@ from djet_ros.core.types import Pose, RelativePose, Status
 from djet_ros.lab.coverage import (
     Coverage,
     coverage_rows,
+    draw_reliability,
     LEVELS,
     normalised_square,
     share_with_bounds,
@@ -133,6 +135,13 @@ def test_a_motion_invented_of_a_standstill_is_wrong_and_sure() -> None:
     row, = coverage_rows([invented, humble, held, record(square=nan, claims=(0.1, 50.0))])
     assert (row.told, row.failed, row.given_up, row.needlessly, row.wrong_and_sure) == (
         0, 1, 1, 0, 1)
+
+
+def test_a_scene_without_motion_has_an_empty_plot_and_no_warning(tmp_path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        draw_reliability([record(square=float('nan'), stood=True)], tmp_path / 'plot.png')
+    assert (tmp_path / 'plot.png').stat().st_size > 0
 
 
 def test_a_recorded_table_shows_unreported_errors_or_a_dash_if_they_were_not_counted(

@@ -261,5 +261,6 @@ def draw_reliability(records: Sequence[Coverage], path: Path) -> None:
                  xlim=(0, 1), ylim=(0, 1))
         right.set(xlabel='probability of an error outside', xscale='log', yscale='log',
                   ylabel='share of poses', xlim=(1e-6, 1), ylim=(1e-4, 1))
-        # The corner that calibrated covariances leave empty.
-        left.legend(fontsize=6, loc='lower right')
+        # In the corner that calibrated covariances leave empty; without a pose there is no curve.
+        if any(record.has_nees for record in records):
+            left.legend(fontsize=6, loc='lower right')
