@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import cv2
 from djet_ros.core.corners import detect_corners
+from djet_ros.core.fusion import MeasuredRotation
 from djet_ros.core.geometry import rotation_angle, rotation_exp, unit
 from djet_ros.core.prediction import likely_rotation, predict_at_infinity, predict_constant_motion
-from djet_ros.core.types import RelativePose, Status
+from djet_ros.core.starts import KnownMotion
+from djet_ros.core.types import Pose, RelativePose, Status
 import numpy as np
 import pytest
 from two_view import some, textured
@@ -94,3 +96,13 @@ def test_prediction_after_a_pure_rotation():
     turned = predict_at_infinity(features, features, K, [prior.R], 30.0, measured=True)
     assert np.allclose(predict_constant_motion(features, K, prior.R, still), turned)
     assert np.abs(predict_constant_motion(features, K, prior.R, prior) - turned).max() < 1e-3
+
+
+def test_a_camera_that_stood_is_likelier_not_to_have_turned_than_a_guess_says() -> None:
+    turned, guessed = (rotation_exp(np.array([0, angle, 0])) for angle in (0.01, 0.02))
+    gyro = MeasuredRotation(turned, np.eye(3) * 1e-6)
+    known = KnownMotion(gyro, Pose(guessed, np.array([0, 0, -1.0])), stood=True)
+    for one, rotations in ((known, (turned, np.eye(3), guessed)),
+                           (replace(known, rotation=None), (np.eye(3), guessed)),
+                           (replace(known, stood=False), (turned, guessed))):
+        assert np.array_equal(one.rotations(), rotations)

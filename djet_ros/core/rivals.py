@@ -12,7 +12,14 @@ from dataclasses import dataclass, replace
 
 import cv2
 from djet_ros.core.cells import sum_by_cell
-from djet_ros.core.geometry import chirality_signs, inverse_depths, norms, rays, rotation_log, unit
+from djet_ros.core.geometry import (
+    chirality_signs,
+    inverse_depths,
+    norms,
+    rays,
+    rotation_angle,
+    unit,
+)
 from djet_ros.core.jet import clipped_scale, JetProblem, Loss, robust_scale
 from djet_ros.core.sketch import losses_in_front, refine_all, Sketch
 from djet_ros.core.starts import starts_around, subsampled
@@ -65,11 +72,10 @@ DEEP_RATIO = 0.25
 # chosen: noise of an inverse depth over the near end; above, noise would make a plane look deep.
 _MAX_DEPTH_NOISE = 0.1
 
-
 # chosen: a match that moves by less than this multiple of what counts as still moves slightly; and
-# the share of such matches, of those that are still, beside a camera that stands. It was below a
-# tenth there, and above 0.9 beside one that moves.
-_SLIGHTLY, _MAX_SLIGHTLY = 3.0, 0.25
+# the share of such matches, of those that are still, from which a camera has moved. Before one
+# that stands it was below a tenth, and above 0.9 before one that moves.
+SLIGHTLY, MAX_SLIGHTLY = 3.0, 0.25
 
 
 @dataclass(frozen=True)
@@ -316,11 +322,11 @@ def may_stand(problem: JetProblem, shift: Array, pose: Pose, focal: float, noise
     standard deviation of the matches; all in pixels; least: minimum number of matches that stand
     still; prior: the previous motion.
     """
-    still, slightly = OUTLIER * noise, _SLIGHTLY * OUTLIER * noise
+    still, slightly = OUTLIER * noise, SLIGHTLY * OUTLIER * noise
     standing, moving = (shift < still).sum(), shift > slightly
     between = len(shift) - standing - moving.sum()
-    if (focal * np.linalg.norm(rotation_log(pose.R)) > slightly or standing < least
-            or between >= _MAX_SLIGHTLY * standing
+    if (focal * rotation_angle(pose.R, np.eye(3)) > slightly or standing < least
+            or between >= MAX_SLIGHTLY * standing
             or (prior is not None and pose_distance(prior, pose) < _MAX_CHANGE)):
         return False
     agree = _distances(problem, refine_all(problem, [pose], Loss(), 0)) < INLIER * noise

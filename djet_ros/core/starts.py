@@ -82,8 +82,9 @@ class KnownMotion:
 
     def rotations(self) -> list[Array]:
         """Return the known rotations, (3, 3) each, the most certain first."""
-        known = [one.R for one in (self.rotation, self.guess) if one is not None]
-        return [*known, np.eye(3)] if self.stood else known
+        measured = [] if self.rotation is None else [self.rotation.R]
+        still = [np.eye(3)] if self.stood else []
+        return [*measured, *still, *([] if self.guess is None else [self.guess.R])]
 
 
 def external_starts(K: Array, x: Array, y: Array, known: KnownMotion) -> list[Pose]:

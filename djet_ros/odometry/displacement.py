@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from djet_ros.core.geometry import norms, rotation_angle
+from djet_ros.core.rivals import SLIGHTLY
 from djet_ros.core.types import Array, RelativePose
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +15,6 @@ from scipy.special import fdtrc
 
 # Cell size in pixels.
 _CELL = 32
-
-# A match moves slightly if its displacement is below this multiple of the standstill threshold.
-_SLIGHTLY = 3
 
 # chosen: two matches move together if their displacements differ by less than this share; false
 # ones do by chance once in thirty times.
@@ -51,10 +50,14 @@ class Displaced:
         return Displaced(self.x[chosen], self.shift[chosen], self.inliers[chosen],
                          self.threshold)
 
+    @cached_property
+    def _distances(self) -> Array:
+        return norms(self.shift)
+
     @property
     def still(self) -> NDArray[np.bool_]:
         """Return a mask (N,) of the matches that are still."""
-        return np.asarray(norms(self.shift) < self.threshold)
+        return np.asarray(self._distances < self.threshold)
 
     @property
     def slightly(self) -> NDArray[np.bool_]:
@@ -64,7 +67,7 @@ class Displaced:
     @property
     def near(self) -> NDArray[np.bool_]:
         """Return a mask (N,) of the matches that are still or move slightly."""
-        return np.asarray(norms(self.shift) < _SLIGHTLY * self.threshold)
+        return np.asarray(self._distances < SLIGHTLY * self.threshold)
 
     def without_drift(self) -> Displaced:
         """Return the same without the median displacement of those that move slightly at most."""
@@ -78,17 +81,17 @@ class Displaced:
             return self.x[:0]
         neighbour = cKDTree(self.x).query(self.x, 2)[1][:, 1]
         apart = norms(self.shift - self.shift[neighbour])
-        return self.x[apart < _ALIKE * norms(self.shift)]
+        return self.x[apart < _ALIKE * self._distances]
 
 
-def cells(x: Array) -> Array:
-    """Return all distinct cells of the image, (M, 2), that pixels x (N, 2) are in."""
-    return np.unique(cell_of(x), axis=0)
+def cells(x: Array) -> NDArray[np.complex128]:
+    """Return all distinct cells of the image (M,) that pixels x (N, 2) are in."""
+    return np.unique(cell_of(x))
 
 
-def cell_of(x: Array) -> Array:
-    """Return the cell (N, 2) that each pixel is in."""
-    return np.floor_divide(x, _CELL)
+def cell_of(x: Array) -> NDArray[np.complex128]:
+    """Return the cell (N,) that each pixel is in, column + i row."""
+    return identifiers(np.floor_divide(x, _CELL))
 
 
 def turns(relative: RelativePose, K: Array, threshold: float) -> bool:
@@ -97,7 +100,7 @@ def turns(relative: RelativePose, K: Array, threshold: float) -> bool:
 
     K: (3, 3) camera matrix; threshold: of the standstill in pixels.
     """
-    return bool(K[0, 0] * rotation_angle(relative.R, np.eye(3)) > _SLIGHTLY * threshold)
+    return bool(K[0, 0] * rotation_angle(relative.R, np.eye(3)) > SLIGHTLY * threshold)
 
 
 def drifted(x: Array, y: Array, least: float) -> bool:
@@ -118,5 +121,5 @@ def drifted(x: Array, y: Array, least: float) -> bool:
 
 
 def identifiers(x: Array) -> NDArray[np.complex128]:
-    """Return pixels (..., 2) as one number each, to compare sets of them."""
-    return np.asarray(x[..., 0] + 1j * x[..., 1], np.complex128)
+    """Return pixels (N, 2) as one number each, to compare sets of them."""
+    return np.asarray(x[:, 0] + 1j * x[:, 1], np.complex128)

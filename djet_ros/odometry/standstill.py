@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from djet_ros.core.geometry import norms
+from djet_ros.core.rivals import MAX_SLIGHTLY
 from djet_ros.core.types import Array, RelativePose, Status, TRACKED
 from djet_ros.odometry.displacement import cell_of, cells, Displaced, drifted, identifiers, turns
 import numpy as np
@@ -26,9 +27,9 @@ _LEAST_STILL = 10
 # thirtieth of false matches does.
 _TOGETHER = 0.25
 
-# chosen: least number of features that move slightly if a camera that does not turn has moved, as
-# a share of those that are still and of all that stood before: false matches are few of these.
-_SLIGHTLY_IF_MOVED, _SLIGHTLY_OF_ALL = 0.25, 0.15
+# chosen: least share of features that move slightly, of all that stood before, if a camera that
+# does not turn has moved: false matches are few of these.
+_SLIGHTLY_OF_ALL = 0.15
 
 # chosen: share of still matches from which what stood is searched near its place.
 _STATIC = 0.9
@@ -83,23 +84,19 @@ class Standstill:
         """
         if not len(relative.x) or (not at_rest and self._hidden > _LONGEST_HIDDEN):
             return False
-        if _nothing_moves(relative, self._is_apart(relative.x), threshold):
+        apart = self._is_apart(relative.x)
+        if _nothing_moves(relative, apart, threshold):
             return True
-        matches = self._matches(relative, threshold)
+        matches = Displaced.of(relative, threshold).among(apart)
         if at_rest is False or (at_rest is None and self._static_features_move(matches, None)):
             return False
         return (self._only_others_move(_world(matches, at_rest, horizon), bool(at_rest))
                 or self._static_features_are_still(matches, at_rest))
 
-    def _matches(self, relative: RelativePose, threshold: float) -> Displaced:
-        """Return the matches that are not on what is attached to the camera."""
-        return Displaced.of(relative, threshold).among(self._is_apart(relative.x))
-
     def _is_apart(self, x: Array) -> NDArray[np.bool_]:
         """Return which pixels (N, 2) are not on what is attached to the camera, nor just above."""
-        cell = cell_of(x)
-        attached = np.isin(identifiers(np.stack([cell, cell + np.array([0, 1])])), self._attached)
-        return np.asarray(~attached.any(0))
+        cell, below = cell_of(x), 1j
+        return ~(np.isin(cell, self._attached) | np.isin(cell + below, self._attached))
 
     def take(self, relative: RelativePose, K: Array, threshold: float) -> None:
         """
@@ -113,9 +110,8 @@ class Standstill:
             return
         self._stood = False
         below = Displaced.of(relative, threshold).among(relative.x[:, 1] > K[1, 2])
-        moved, still = (np.unique(identifiers(cell_of(below.x[where])))
-                        for where in (~below.still, below.still))
-        self._attached = np.setdiff1d(np.union1d(self._attached, still), moved)
+        self._attached = np.setdiff1d(np.union1d(self._attached, cells(below.x[below.still])),
+                                      cells(below.x[~below.still]))
 
     @property
     def may_stand(self) -> bool:
@@ -133,7 +129,7 @@ class Standstill:
         static = self._static_among(matches, at_rest)
         still, slightly = static.still, static.slightly
         if slightly.sum() >= max(_LEAST_STILL, _SLIGHTLY_OF_ALL * len(static.x),
-                                 _SLIGHTLY_IF_MOVED * still.sum()):
+                                 MAX_SLIGHTLY * still.sum()):
             return True
         moving = static.among(~still & ~slightly)
         together = moving.together()
@@ -158,7 +154,7 @@ class Standstill:
         It does if it stood before, unless static features move in most of the image; if that is
         unknown, enough matches have to be still. at_rest, horizon: as for ``detect``.
         """
-        matches = self._matches(relative, threshold)
+        matches = Displaced.of(relative, threshold).among(self._is_apart(relative.x))
         if self._stood is None:
             world = _world(matches, at_rest, horizon)
             return bool(world.still.sum() >= max(_LEAST_STILL, world.slightly.sum()))
@@ -188,7 +184,7 @@ class Standstill:
             return False
         spread = len(cells(matches.x[still])) / len(cells(matches.x))
         least = _STILL_AS_BEFORE if at_rest and self._stood is not False else _STILL
-        slightly = 1.0 if at_rest else _SLIGHTLY_IF_MOVED
+        slightly = 1.0 if at_rest else MAX_SLIGHTLY
         return bool(still.mean() > least and spread > least
                     and matches.slightly.sum() < slightly * still.sum())
 
