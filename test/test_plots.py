@@ -46,6 +46,19 @@ def kept(drawn: dict[str, Figure]) -> Any:
     return keeping
 
 
+@pytest.mark.parametrize('values', [[1e-6, 1.0], [0.3, 0.9]])
+def test_logarithmic_axes_are_labelled_by_numbers(tmp_path: Path, values: list[float]) -> None:
+    """Formulas are not parsed, as the name of a folder may have a $."""
+    with figure(tmp_path / 'plot.png', 5, 3) as drawn:
+        axes = drawn.subplots()
+        axes.loglog(values, values)
+    labels = [label.get_text() for which in ('major', 'minor')
+              for label in axes.get_xticklabels(which=which)]
+    shown = [float(label) for label in labels if label]
+    assert len(shown) > 1
+    assert any(values[0] <= number <= values[1] for number in shown)
+
+
 @pytest.mark.parametrize(('far', 'right'), [(8.0, 8.0), (50.0, 20.0)])
 def test_a_trajectory_is_shown_with_landmarks_up_to_its_own_extent_away(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch, far: float, right: float) -> None:

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from matplotlib import rc_context
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter, LogFormatterMathtext
 
 Look = TypeVar('Look')
 
@@ -51,5 +52,23 @@ def figure(path: Path, width: float, height: float) -> Iterator[Figure]:
     with rc_context(STYLE):
         empty = Figure(figsize=(width, height), layout='constrained')
         yield empty
+        _label_logarithms(empty)
         path.parent.mkdir(parents=True, exist_ok=True)
         empty.savefig(path, dpi=120)
+
+
+class _Decimal(LogFormatter):
+    """Labels the same ticks of a logarithmic axis as usual, but by decimal numbers."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        """Return the label of a tick, empty if it has none."""
+        return f'{x:g}' if super().__call__(x, pos) else ''
+
+
+def _label_logarithms(drawn: Figure) -> None:
+    """Label logarithmic axes by numbers, as formulas are not parsed."""
+    for axis in (axis for axes in drawn.axes for axis in (axes.xaxis, axes.yaxis)):
+        if isinstance(axis.get_major_formatter(), LogFormatterMathtext):
+            axis.set_major_formatter(_Decimal())
+        if isinstance(axis.get_minor_formatter(), LogFormatterMathtext):
+            axis.set_minor_formatter(_Decimal())
