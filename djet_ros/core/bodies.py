@@ -17,10 +17,10 @@ from djet_ros.core.rivals import (
     continues_motion,
     fit_motion,
     INLIER,
+    is_static_world,
     MIN_BODY_SHARE,
     OUTLIER,
     pose_distance,
-    PreviousMotion,
 )
 from djet_ros.core.sketch import refine_all
 from djet_ros.core.surfaces import ReprojectionSurface
@@ -96,10 +96,9 @@ def _nearest(places: Array, x: Array) -> NDArray[np.int64]:
     return np.asarray(cKDTree(places).query(x, count)[1]).reshape(len(x), count)
 
 
-def is_continued(prior: PreviousMotion | None, pair: RelativePose) -> bool:
-    """Return whether a pair goes on by the previous motion, of which the pair before was sure."""
-    return (prior is not None and not prior.undecided
-            and pose_distance(prior, Pose(pair.R, pair.t)) < _CONTINUING)
+def is_continued(prior: Pose | None, pair: RelativePose) -> bool:
+    """Return whether a pair goes on by the previous motion."""
+    return prior is not None and pose_distance(prior, Pose(pair.R, pair.t)) < _CONTINUING
 
 
 def fits_followed_body(pair: RelativePose) -> bool:
@@ -108,23 +107,41 @@ def fits_followed_body(pair: RelativePose) -> bool:
     return bool(2 * fitting.sum() > len(fitting))
 
 
-def readmitted(pair: RelativePose, K: Array) -> NDArray[np.bool_]:
+def motion_left_out(pair: RelativePose, K: Array) -> Pose | None:
+    """Return the motion of the matches that a pair left out, None if they are too few for one."""
+    chosen = np.flatnonzero(~pair.of_body)
+    if len(chosen) < _FEWEST:
+        return None
+    return fit_motion(_reprojection(pair, K).subset(chosen), Pose(pair.R, pair.t), _noise(pair))
+
+
+def readmitted(pair: RelativePose, K: Array, other: Pose | None) -> NDArray[np.bool_]:
     """
     Return which matches (N,) a pair left out that are not of another body after all.
 
     They fit the motion of the pair, and not that of the other body. All if they are too few for a
-    body. K: (3, 3).
+    body. K: (3, 3); other: its motion, see ``motion_left_out``.
     """
     chosen = ~pair.of_body
-    if chosen.sum() < _FEWEST:
+    if other is None:
         return chosen
-    x, y = pair.x[chosen], pair.y[chosen]
-    problem = jet_problem(K, x, ReprojectionSurface(x, y).fit_around(y))
-    noise = _noise(pair)
-    other = fit_motion(problem, Pose(pair.R, pair.t), noise)
-    of_other = np.abs(epipolar_residuals(problem, other.R, other.t).r) < INLIER * noise
-    chosen[chosen] = (_errors(pair)[chosen] < INLIER) & ~of_other
-    return chosen
+    of_other = np.abs(_residuals(_reprojection(pair, K), other)) < INLIER * _noise(pair)
+    return np.asarray(chosen & (_errors(pair) < INLIER) & ~of_other)
+
+
+def is_left_out_world(pair: RelativePose, K: Array, other: Pose | None) -> bool:
+    """
+    Return whether the matches that a pair left out are the static world, as their depths tell.
+
+    The pair before may have followed a moving object. K, other: as for ``readmitted``.
+    """
+    return other is not None and is_static_world(
+        _reprojection(pair, K), other, Pose(pair.R, pair.t), _noise(pair))
+
+
+def _reprojection(pair: RelativePose, K: Array) -> JetProblem:
+    """Return the problem of the re-projection errors of all matches of a pair."""
+    return jet_problem(K, pair.x, ReprojectionSurface(pair.x, pair.y).fit_around(pair.y))
 
 
 class Continuing(NamedTuple):

@@ -12,6 +12,8 @@ from djet_ros.core.basins import BASIN_TUNING
 from djet_ros.core.bodies import (
     fits_followed_body,
     is_continued,
+    is_left_out_world,
+    motion_left_out,
     of_followed_body,
     readmitted,
 )
@@ -155,41 +157,48 @@ class TwoViewEstimator:
         Estimate the motion of the body that the previous pair followed.
 
         If another body moved there, its matches are left out: by now they may be the majority, or
-        fit a compromise of both motions. But all are used if no other body moves any more, or if
-        they go on by the previous motion, or by one that the previous pair left open.
+        fit a compromise of both motions. But all are used if no other body moves any more, if they
+        go on by the previous motion, or by one that the previous pair left open, or if the others
+        alone fit worse than before and do not go on by it. (A body that hides most of the world
+        leaves few matches, and many of those are false.) If depths tell that what was left out is
+        the static world, the pair is estimated without regard to the one before.
         """
         if prior is None:
             return self.estimate_pair(pair)
         followed = of_followed_body(prior, pair.x)
         if (~followed).sum() <= MIN_BODY_SHARE * len(followed):
             return self.estimate_pair(pair)
-        alone = self._estimate_alone(pair, prior, followed)
-        if (alone is not None and is_continued(pair.prior, alone)
-                and not fits_followed_body(alone)):
+        alone = self._estimate_alone(pair, followed)
+        if alone is None:
+            return self.estimate_pair(pair)
+        K, before, continued = pair.current.K, pair.prior, is_continued(pair.prior, alone)
+        reliable = _within_limits(alone, _limits_from(prior))
+        left_out = motion_left_out(alone, K)
+        if is_left_out_world(alone, K, left_out):
+            return self.estimate_pair(
+                replace(pair, prior=None, predicted=None, limits=Limits()))
+        alone = replace(alone, left_out=~alone.of_body & ~readmitted(alone, K, left_out))
+        sure = reliable and continued and before is not None and not before.undecided
+        if sure and not fits_followed_body(alone):
             return alone
         result = self.estimate_pair(pair)
-        if alone is None or _is_same(alone, result):
+        if not (reliable or continued) or _is_same(alone, result):
             return result
-        before, one, other = pair.prior, _pose(alone), _pose(result)
+        one, other = _pose(alone), _pose(result)
         goes_on = before is not None and (
             continues_motion(before, other, one) or before.leaves_open(one, other))
         return result if goes_on else alone
 
-    def _estimate_alone(self, pair: Pair, prior: RelativePose, followed: NDArray[np.bool_]
-                        ) -> RelativePose | None:
+    def _estimate_alone(self, pair: Pair, followed: NDArray[np.bool_]) -> RelativePose | None:
         """
         Estimate the motion of some of the matches (N,) alone.
 
-        None if they do not fit one motion as before: also if that is a rotation alone, or if some
-        of them turn out to be attached to the camera.
+        None if they do not determine one motion: also if that is a rotation alone, or if some of
+        them turn out to be attached to the camera.
         """
         result = self.estimate_pair(pair.of(followed))
-        found = (result.t.any() and len(result.x) == followed.sum()
-                 and _within_limits(result, _limits_from(prior)))
-        if not found:
-            return None
-        whole = with_left_out(result, pair, followed)
-        return replace(whole, left_out=~whole.of_body & ~readmitted(whole, pair.current.K))
+        found = result.status is Status.OK and len(result.x) == followed.sum()
+        return with_left_out(result, pair, followed) if found else None
 
     def match(self, previous: View, current: View) -> Matches:
         """Match the features of two views: pixels x and y (N, 2), the most reliable first."""

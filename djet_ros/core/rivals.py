@@ -69,6 +69,10 @@ _FAR_QUANTILE, _NEAR_QUANTILE = 0.1, 0.95
 # ground in front of the camera to the horizon.
 DEEP_RATIO = 0.25
 
+# chosen: ratio above which points may be of one body: it is about as deep as it is wide, and no
+# nearer than its depth.
+_COMPACT_BODY = 0.5
+
 # chosen: noise of an inverse depth over the near end; above, noise would make a plane look deep.
 _MAX_DEPTH_NOISE = 0.1
 
@@ -255,12 +259,49 @@ def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
     agreeing = members[outliers].sum()
     if agreeing < least or agreeing <= len(outliers) / 2:
         return None
-    only_first = (distances < INLIER * scale) & ~members
-    only_second = members & (distances > OUTLIER * scale)
-    return SecondMotion(first, pose, members,
-                        _area(places[only_second]) / max(_area(places[only_first]), 1e-9),
-                        (_flatness(problem.subset(only_first), first),
-                         _flatness(problem.subset(only_second), pose)))
+    exclusive = _exclusive(distances, members, scale)
+    only_first, only_second = (places[each] for each in exclusive)
+    return SecondMotion(first, pose, members, _area(only_second) / max(_area(only_first), 1e-9),
+                        _flatness_of_both(problem, (first, pose), exclusive))
+
+
+def _exclusive(distances: Array, members: NDArray[np.bool_], scale: float
+               ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """
+    Return which matches (N,) fit the first of two motions only, and which the second only.
+
+    distances: (N,) to the lines of the first; members: (N,) bool, inliers of the second.
+    """
+    return (distances < INLIER * scale) & ~members, members & (distances > OUTLIER * scale)
+
+
+def _flatness_of_both(problem: JetProblem, motions: tuple[Pose, Pose],
+                      exclusive: tuple[NDArray[np.bool_], NDArray[np.bool_]]
+                      ) -> tuple[float, float]:
+    """Return near over far depth of the matches (N,) bool that each of two motions has alone."""
+    first, second = (_flatness(problem.subset(np.flatnonzero(only)), motion)
+                     for motion, only in zip(motions, exclusive))
+    return first, second
+
+
+def static_by_depth(flatness: tuple[float, float]) -> int | None:
+    """
+    Return which of two bodies, 0 or 1, is the static world; None if depths do not tell.
+
+    It is the one whose points span near to far depths, if those of the other do not.
+    """
+    for one, other in ((0, 1), (1, 0)):
+        if flatness[one] < DEEP_RATIO and flatness[other] > _COMPACT_BODY:
+            return one
+    return None
+
+
+def is_static_world(problem: JetProblem, one: Pose, other: Pose, scale: float) -> bool:
+    """Return whether depths tell that one of two motions is the camera's: `static_by_depth`."""
+    distances, to_other = (
+        _distances(problem, refine_all(problem, [pose], Loss(), 0)) for pose in (one, other))
+    exclusive = _exclusive(distances, to_other < INLIER * scale, scale)
+    return static_by_depth(_flatness_of_both(problem, (one, other), exclusive)) == 0
 
 
 def fit_motion(problem: JetProblem, near: Pose, scale: float) -> Pose:

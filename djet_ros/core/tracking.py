@@ -19,7 +19,6 @@ from djet_ros.core.jet import Loss
 from djet_ros.core.pair import Pair
 from djet_ros.core.rivals import (
     continues_motion,
-    DEEP_RATIO,
     is_planar,
     motion_without_attached,
     planar_twin,
@@ -28,6 +27,7 @@ from djet_ros.core.rivals import (
     second_motion,
     SecondMotion,
     SIGNIFICANT_PREFERENCE,
+    static_by_depth,
     unsigned_distance,
 )
 from djet_ros.core.surfaces import ResidualSurface
@@ -38,10 +38,6 @@ from numpy.typing import NDArray
 # chosen: area of a body's matches, relative to those of the other motion, below which it is not
 # mistaken for the static world.
 _SMALL_BODY = 0.3
-
-# chosen: ratio of near to far depth above which points may be of one body: it is about as deep as
-# it is wide, and no nearer than its depth.
-_COMPACT_BODY = 0.5
 
 
 def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
@@ -261,8 +257,4 @@ def _decide_camera(second: SecondMotion, prior: Pose | None,
             return one
     if second.width < _SMALL_BODY:
         return 0
-    for one, other in orders:
-        compact = second.flatness[other] > _COMPACT_BODY
-        if second.flatness[one] < DEEP_RATIO and compact:
-            return one
-    return None
+    return static_by_depth(second.flatness)
