@@ -316,3 +316,18 @@ def test_noise_does_not_creep_nor_do_things_that_pass_nor_too_few_features() -> 
     for count, creeps in ((3, False), (4, True)):
         x = WORLD[:count]
         assert Standstill().creeps(seen(x, x + 0.5 * MOST * RIGHT), MOST) is creeps
+
+
+@pytest.mark.parametrize('step', [0.03, 0.06, 0.2])
+def test_a_camera_that_is_slow_from_the_first_frame_on_moves(step: float) -> None:
+    """Points of a street, 6 to 600 metres ahead, move by any amount, of which none stands out."""
+    rng = np.random.default_rng(7)
+    x = rng.uniform((0, 0), (1240, 376), (1500, 2))
+    y = x + (x - K[:2, 2]) * step / np.exp(rng.uniform(np.log(6), np.log(600), (1500, 1)))
+    still = np.linalg.norm(y - x, axis=1) < MOST
+    assert still.sum() > 100
+    assert not likely_stands(Standstill(), seen(x, y, np.ones(len(x), bool)), None)
+
+
+def test_a_camera_seems_to_stand_from_the_first_frame_on_if_few_points_move_slightly() -> None:
+    assert likely_stands(Standstill(), behind_a_lorry(stand=120), None)

@@ -1,28 +1,32 @@
 """The pair before decides which of the motions that a pair alone leaves open is the true one."""
 
-from itertools import pairwise
+from itertools import pairwise, product
 
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.geometry import direction_angle, rotation_angle, unit
 from djet_ros.core.three_views import consistent_motion
 from djet_ros.core.types import Pose, RelativePose, Rival, Status
+from djet_ros.lab.scenes.catalogue import make_scene
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.visual_odometry import VisualOdometry
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from scipy.interpolate import interp1d
+from scipy.spatial.transform import Rotation, Slerp
 from two_view import flight_over_a_plane, K, project, SIZE
 
 NOISE = 0.1
 
 
-def three_views_of_a_plane(seed: int, far: int = 0) -> list[tuple[RelativePose, Pose, Pose]]:
+def three_views_of_a_plane(seed: int, far: int = 0, speed: float = 1.0
+                           ) -> list[tuple[RelativePose, Pose, Pose]]:
     """
     Return two pairs that follow one another, each with its true motion, and with its twin.
 
     Each has its matches in an order of its own, and lacks some of the points of the other. far:
-    number of points that are so far behind the plane that they have no parallax.
+    number of points that are so far behind the plane that they have no parallax; speed: factor of
+    the motions, a twentieth of the distance to the plane.
     """
     rng = np.random.default_rng(seed)
     x = rng.uniform((20, 20), np.array(SIZE) - 20, (400, 2))
@@ -33,7 +37,7 @@ def three_views_of_a_plane(seed: int, far: int = 0) -> list[tuple[RelativePose, 
     pixels, pairs, noise = x, [], rng.normal(0, NOISE, (3, *x.shape))
     for number in (1, 2):
         R = Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix()
-        t = rng.normal(size=3) * (0.5, 0.5, 0.3)
+        t = speed * rng.normal(size=3) * (0.5, 0.5, 0.3)
         H = R + np.outer(t, normal)
         points = points @ R.T + t
         # n.X = 1 before, so that X' = H X, and n' = H^-T n.
@@ -61,14 +65,20 @@ def of_motions(pair: RelativePose, *motions: Pose) -> RelativePose:
                         rivals=tuple(Rival(rival, 0.0) for rival in rivals))
 
 
-@pytest.mark.parametrize('seed', range(20))
-def test_the_true_motion_of_a_plane_is_found_whichever_was_taken_first(seed: int):
-    (before, *earlier), (current, *later) = three_views_of_a_plane(seed)
-    for one in (earlier, earlier[::-1]):
-        for other in (later, later[::-1]):
+def test_the_true_motion_of_a_plane_is_found_whichever_was_taken_first():
+    missed = 0
+    for seed in range(20):
+        (before, *earlier), (current, *later) = three_views_of_a_plane(seed)
+        for one, other in product((earlier, earlier[::-1]), (later, later[::-1])):
             found = consistent_motion(of_motions(before, *one), of_motions(current, *other), K)
-            assert found is not None
-            assert np.array_equal(found.R, later[0].R) and np.array_equal(found.t, later[0].t)
+            if found is None:
+                # Against the matches' own choice, clear evidence is needed.
+                assert other[0] is not later[0]
+                missed += 1
+            else:
+                assert np.array_equal(found.R, later[0].R)
+                assert np.array_equal(found.t, later[0].t)
+    assert missed <= 2
 
 
 def test_matches_that_slip_along_their_epipolar_lines_rarely_hide_the_true_motion():
@@ -116,6 +126,19 @@ def test_a_pair_taken_as_a_rotation_in_place_decides_nothing(rotates: int):
         assert consistent_motion(*pairs, K) is None
 
 
+def test_a_slow_camera_hardly_ever_finds_that_its_matches_chose_the_wrong_motion():
+    """Displacements are a few times the noise: in one pair of some hundred it prefers the twin."""
+    decided = 0
+    for seed in range(200):
+        (before, *earlier), (current, *later) = three_views_of_a_plane(seed, speed=0.03)
+        if not (earlier[1].t.any() and later[1].t.any()):
+            continue  # A rotation alone explains the plane.
+        found = consistent_motion(of_motions(before, *earlier), of_motions(current, *later), K)
+        assert found is None or np.array_equal(found.t, later[0].t)
+        decided += found is not None
+    assert decided > 100
+
+
 def test_a_wrong_motion_before_decides_nothing():
     (before, _, wrong), (current, *later) = three_views_of_a_plane(3)
     assert consistent_motion(of_motions(before, wrong), of_motions(current, *later), K) is None
@@ -133,8 +156,32 @@ def test_the_sign_of_t_alone_is_not_decided():
     assert consistent_motion(of_motions(before, *earlier), both, K) is None
 
 
+def slowed(poses: np.ndarray, factor: int) -> np.ndarray:
+    """Return poses (M, 4, 4) with so many steps in place of each between some (N, 4, 4)."""
+    times = np.arange((len(poses) - 1) * factor + 1) / factor
+    turns = Rotation.from_matrix(poses[:, :3, :3])
+    finer = np.tile(np.eye(4), (len(times), 1, 1))
+    finer[:, :3, :3] = Slerp(np.arange(len(poses)), turns)(times).as_matrix()
+    finer[:, :3, 3] = interp1d(np.arange(len(poses)), poses[:, :3, 3], axis=0)(times)
+    return finer
+
+
 @pytest.mark.slow
-def test_over_flat_ground_pairs_after_the_first_ones_have_the_true_motion():
+def test_a_slow_camera_over_a_seafloor_is_not_led_to_the_motion_of_a_plane():
+    """With a quarter of the usual step the floor is flat, to within the noise of a pair."""
+    scene, odometry, start = make_scene('underwater', 20), VisualOdometry(), 50
+    poses = slowed(scene.trajectory(16)[12:], 4)[2:]
+    for index, pose in enumerate(poses):
+        result = odometry.process(Frame(scene.render(pose, start + index), scene.K, index))
+        if result.status is Status.OK:
+            assert result.relative is not None
+            truth = np.linalg.inv(pose) @ poses[index - 1]
+            assert direction_angle(result.relative.t, truth[:3, 3]) < np.radians(2)
+    assert result.status is Status.OK
+
+
+@pytest.mark.slow
+def test_over_flat_ground_nearly_all_pairs_after_the_first_ones_have_the_true_motion():
     """By themselves a third of them are ambiguous: the lens is too narrow for chirality."""
     estimator, alone, in_a_row = TwoViewEstimator(), [], []
     for seed in range(6):
@@ -147,6 +194,7 @@ def test_over_flat_ground_pairs_after_the_first_ones_have_the_true_motion():
         in_a_row += [result.status for result in results[3:]]
         for result, before, after in zip(results[3:], poses[2:], poses[3:]):
             true_motion = np.linalg.inv(before) @ after
-            assert np.degrees(direction_angle(result.motion[:3, 3], true_motion[:3, 3])) < 2
+            if result.status is Status.OK:
+                assert np.degrees(direction_angle(result.motion[:3, 3], true_motion[:3, 3])) < 2
     assert alone.count(Status.AMBIGUOUS) > len(alone) / 3
-    assert set(in_a_row) == {Status.OK}
+    assert in_a_row.count(Status.OK) >= 0.85 * len(in_a_row)

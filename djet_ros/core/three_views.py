@@ -27,6 +27,11 @@ _MIN_POINTS = 30
 # the same matches; it is 2 and more if the shutter rolls.
 _MAX_NOISE = 1.5
 
+# Preference that decides against the motion that the matches of the pair chose; as for basins
+# before they have converged. Where a camera is slow, a hundredth of its depth per pair is noise,
+# and 3 to 7 was common for the wrong motion; 12 and more for the right one of a plane.
+_CLEAR_PREFERENCE = 5.0
+
 # Robust standard deviations beyond which a point is an outlier.
 _OUTLIER = 4.0
 
@@ -62,7 +67,8 @@ def consistent_motion(before: RelativePose, current: RelativePose, K: Array) -> 
         return None
     chosen = best % len(motions)
     others = np.arange(len(errors)) % len(motions) != chosen
-    decided = (preferences(losses, x, best)[others] >= SIGNIFICANT_PREFERENCE).all()
+    least = SIGNIFICANT_PREFERENCE if chosen == 0 else _CLEAR_PREFERENCE
+    decided = (preferences(losses, x, best)[others] >= least).all()
     return motions[chosen] if decided else None
 
 

@@ -152,12 +152,14 @@ class Standstill:
         Return whether a camera that does not rotate more likely stands than has started to move.
 
         It does if it stood before, unless static features move in most of the image; if that is
-        unknown, enough matches have to be still. at_rest, horizon: as for ``detect``.
+        unknown, enough matches have to be still, and few others may move slightly. at_rest,
+        horizon: as for ``detect``.
         """
         matches = Displaced.of(relative, threshold).among(self._is_apart(relative.x))
         if self._stood is None:
             world = _world(matches, at_rest, horizon)
-            return bool(world.still.sum() >= max(_LEAST_STILL, world.slightly.sum()))
+            return bool(world.still.sum() >= _LEAST_STILL
+                        and world.slightly.sum() < MAX_SLIGHTLY * world.still.sum())
         return self._stood and not self._static_features_move(matches, at_rest)
 
     def creeps(self, relative: RelativePose, threshold: float) -> bool:
