@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import ClassVar
 
 from cards import Cards, DEPTHS, K as CARDS_K, pose
 from djet_ros.config.sections import OdometryConfig
@@ -234,7 +235,9 @@ def test_motion_too_slow_for_parallax_from_frame_to_frame_accumulates(cards, way
     drive, slow = Drive(cards), [pose(x=way, yaw=0.001 * (-1)**i) for i in range(30)]
     start = drive.go(steps(LENGTHS[:4]))[-1].pose
     results = drive.go(slow)
-    assert all(result.status is Status.NO_PARALLAX for result in results)
+    # Unless new landmarks are needed, and the reference frame waits for it.
+    assert sum(result.status is Status.OK for result in results) < 3
+    assert all(result.status in TRACKED for result in results)
     gone = (np.linalg.inv(start) @ results[-1].pose)[:3, 3] * LENGTHS[0]
     assert np.linalg.norm(gone - [30 * way, 0, 0]) < 0.1 * 30 * way
     sigma = np.sqrt(np.linalg.eigvalsh(results[-1].pose_covariance[:3, :3])[-1]) * LENGTHS[0]
@@ -253,6 +256,42 @@ def test_motion_too_slow_for_parallax_accumulates_before_there_are_landmarks(car
     assert np.linalg.norm(gone - [40 * way, 0, 0]) < 0.1 * 40 * way
     sigma = np.sqrt(np.linalg.eigvalsh(results[-1].pose_covariance[:3, :3])[-1])
     assert np.linalg.norm(gone - [40 * way, 0, 0]) < 4 * sigma
+
+
+class Previewed(TrackScale):
+    """A scale that previews each step before it is made."""
+
+    lengths: ClassVar[list[Length]] = []
+    _previews = False
+
+    def of_step(self, *arguments):
+        if not self._previews:
+            self._previews = True
+            self.lengths.append(self.preview(*arguments).length)
+            self._previews = False
+        return super().of_step(*arguments)
+
+
+def test_a_preview_of_a_step_leaves_the_track_as_it_is(cards):
+    """Of all kinds of pairs: those with parallax, and those without."""
+    plain, previewing = Drive(cards), Drive(cards)
+    previewing.odometry._scale.__class__ = Previewed
+    moves = [*steps(LENGTHS[:6]), *[pose(x=0.01)] * 4, *[pose(yaw=0.06)] * 8, *steps(LENGTHS[:3])]
+    for one, other in zip(plain.go(moves), previewing.go(moves), strict=True):
+        assert np.array_equal(one.pose, other.pose)
+        assert np.array_equal(one.pose_covariance, other.pose_covariance)
+    assert sum(length.known for length in Previewed.lengths) > 12
+
+
+def test_a_camera_that_stops_after_it_moved_a_little_is_seen_to_stand(cards):
+    """Also if its reference frame was kept for parallax, as new landmarks were needed."""
+    drive = Drive(cards)
+    drive.go([*steps(LENGTHS[:4]), *[pose(yaw=0.06)] * 8])
+    assert drive.odometry._scale.needs_parallax
+    drive.go([pose(x=0.03)] * 2)
+    stopped = drive.go([np.eye(4)] * 30)
+    assert all(result.status is Status.NO_PARALLAX for result in stopped)
+    assert all(result.stationary for result in stopped[22:])
 
 
 def test_a_bad_frame_does_not_change_the_scale(cards):

@@ -15,7 +15,7 @@ from djet_ros.core.jet import Loss, robust_scale
 from djet_ros.core.known_depths import same_points
 from djet_ros.core.paraboloid import weighted_median
 from djet_ros.core.rivals import preferences, SIGNIFICANT_PREFERENCE
-from djet_ros.core.types import Array, Pose, RelativePose
+from djet_ros.core.types import Array, Pose, RelativePose, Status
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,9 +27,10 @@ _MIN_POINTS = 30
 # the same matches; it is 2 and more if the shutter rolls.
 _MAX_NOISE = 1.5
 
-# Preference that decides against the motion that the matches of the pair chose; as for basins
-# before they have converged. Where a camera is slow, a hundredth of its depth per pair is noise,
-# and 3 to 7 was common for the wrong motion; 12 and more for the right one of a plane.
+# Preference that decides what the matches of the pair leave open, or against their choice; as for
+# basins before they have converged. Where a camera is slow, a step of a hundredth of the depth is
+# hardly more than noise, and preferences of 3 to 7 for the wrong motion were common; for the right
+# one of a plane they are 12 and more if it is fast.
 _CLEAR_PREFERENCE = 5.0
 
 # Robust standard deviations beyond which a point is an outlier.
@@ -67,7 +68,8 @@ def consistent_motion(before: RelativePose, current: RelativePose, K: Array) -> 
         return None
     chosen = best % len(motions)
     others = np.arange(len(errors)) % len(motions) != chosen
-    least = SIGNIFICANT_PREFERENCE if chosen == 0 else _CLEAR_PREFERENCE
+    confirmed = chosen == 0 and current.status is Status.OK
+    least = SIGNIFICANT_PREFERENCE if confirmed else _CLEAR_PREFERENCE
     decided = (preferences(losses, x, best)[others] >= least).all()
     return motions[chosen] if decided else None
 

@@ -13,6 +13,7 @@ before and after.
 
 from __future__ import annotations
 
+from copy import copy, deepcopy
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -176,6 +177,9 @@ class Window:
         self.lens = lens or SelfCalibration.unknown(view.K, view.gray.shape)
         self._poses = Poses(np.eye(3)[None], np.zeros((1, 3)), self.lens.residual_k1)
         self._is_keyframe, self._has_landmarks = [True], [False]
+        # Whether the newest frame would be a keyframe if it had parallax; and whether the one
+        # before it has just become one.
+        self._is_due = self._became_keyframe = False
         self._landmarks = Landmarks.at(np.empty((0, 2)), np.empty(0), 0, 1)
         self._prior = PosePrior.holding(self._poses)
         self._scale = 1.0
@@ -188,15 +192,33 @@ class Window:
         self._cached_lengths: tuple[RelativePose, Lengths] | None = None
         self.final_landmarks = np.empty((0, 3))
 
+    def copied(self) -> Window:
+        """Return a window that goes on by itself; images are shared."""
+        window = copy(self)
+        for name in ('_views', '_is_keyframe', '_has_landmarks'):
+            setattr(window, name, list(getattr(self, name)))
+        for name in ('_landmarks', '_prior', '_published'):
+            setattr(window, name, deepcopy(getattr(self, name)))
+        return window
+
     @property
     def is_new(self) -> bool:
         """Return whether there is only one frame, so that the next pair defines the unit."""
         return len(self._views) == 1
 
     @property
+    def needs_parallax(self) -> bool:
+        """
+        Return whether landmarks are to be created from the newest frame and the next one.
+
+        Which needs parallax between the two.
+        """
+        return self.is_new or (self._is_due and not self._is_keyframe[-1])
+
+    @property
     def is_keyframe(self) -> bool:
-        """Return whether the newest frame is a keyframe."""
-        return self._is_keyframe[-1]
+        """Return whether the newest frame is a keyframe, or has made the one before it one."""
+        return self._is_keyframe[-1] or self._became_keyframe
 
     def add(self, view: View, relative: RelativePose, guess: float) -> WindowStep:
         """
@@ -210,6 +232,10 @@ class Window:
         length, expected = ((guess, _Measured(guess, _UNIT_SIGMA * guess)) if first
                             else self._length(view, relative, guess))
         self._cached_lengths = None
+        # New landmarks are created from a keyframe and a frame after it, with parallax.
+        self._became_keyframe = bool(
+            relative.t.any() and self._is_due and not self._is_keyframe[-1])
+        self._is_keyframe[-1] |= self._became_keyframe
         self._append(view, relative, length)
         self._add_pair(relative, length, expected)
         # Observe old and new landmarks in the frame; then refine all.
@@ -236,8 +262,9 @@ class Window:
             self._update_lens()
             self._marginalise_landmarks(self._landmarks.anchors == 0)
             self._marginalise_frame(0)
-        if relative.t.any():
-            self._choose_keyframe()
+        # Without parallax new keyframes would only drop landmarks.
+        self._is_due = self._lacks_landmarks()
+        self._is_keyframe[-1] |= bool(self._is_due and relative.t.any())
         self._latest = (relative, addition.length) if relative.t.any() else None
         return addition
 
@@ -373,6 +400,17 @@ class Window:
             return None
         return lengths.median(), lengths.standard_error()
 
+    def length_of_displacement(self, pixels: float) -> float:
+        """
+        Return the length of a translation that displaces landmarks by so much, the median of them.
+
+        Across the viewing direction. Zero if there are too few.
+        """
+        rho = self._known_depths().rho
+        if len(rho) < self._tuning.min_landmarks:
+            return 0.0
+        return float(pixels / (self._K[0, 0] * median(rho)))
+
     def count_agreeing(self, pose: Pose, x: Array, y: Array) -> tuple[int, int]:
         """
         Count the landmarks that agree with a motion, and those that were tested.
@@ -400,26 +438,18 @@ class Window:
             self._landmarks.of(observed if chosen is None else observed & chosen),
             len(self._views) - 1)
 
-    def _choose_keyframe(self) -> None:
-        """
-        Make the newest frame a keyframe if landmarks have moved since the last one, or were lost.
-
-        Only for frames with parallax: without it no new landmarks can be created, and new
-        keyframes would drop the existing ones.
-        """
-        if self._is_keyframe[-1]:
-            return
+    def _lacks_landmarks(self) -> bool:
+        """Return whether landmarks have moved since the last keyframe, or were lost."""
         newest = len(self._views) - 1
         last = max(index for index, chosen in enumerate(self._is_keyframe) if chosen)
         visible = self._landmarks.of(self._landmarks.observed[:, newest])
-        due = len(visible) < (1 - self._tuning.lost) * self._tuning.landmarks
-        if not due:
-            R = self._poses.R[newest] @ self._poses.R[last].T
-            rotated, moved = (self._projected(places) for places in (
-                points_in_frame(self._K, self._poses, visible, last) @ R.T,
-                points_in_frame(self._K, self._poses, visible, newest)))
-            due = median(norms(moved - rotated)) > self._tuning.parallax
-        self._is_keyframe[-1] = due
+        if len(visible) < (1 - self._tuning.lost) * self._tuning.landmarks:
+            return True
+        R = self._poses.R[newest] @ self._poses.R[last].T
+        rotated, moved = (self._projected(places) for places in (
+            points_in_frame(self._K, self._poses, visible, last) @ R.T,
+            points_in_frame(self._K, self._poses, visible, newest)))
+        return bool(median(norms(moved - rotated)) > self._tuning.parallax)
 
     def _append(self, view: View, relative: RelativePose, length: float) -> None:
         new = self._moved(relative, length)

@@ -7,6 +7,7 @@ A source of metric lengths observes that factor (`djet_ros.odometry.scale_filter
 
 from __future__ import annotations
 
+from copy import copy, deepcopy
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -101,6 +102,11 @@ class TrackScale:
         """Return whether there are no landmarks."""
         return not self._uses_landmarks or self._window.is_new
 
+    @property
+    def needs_parallax(self) -> bool:
+        """Return whether new landmarks are needed, or none are used."""
+        return not self._uses_landmarks or self._window.needs_parallax
+
     def landmarks(self, settled: bool = False) -> Array:
         """
         Return points (M, 3), the landmarks in the newest camera, in the unit of its length.
@@ -164,6 +170,11 @@ class TrackScale:
         # An interruption leaves the length of the next step to a guess, which is not metric.
         return Length(usual, usual, True, self._filter.metric and not self._interrupted, False)
 
+    def length_of_displacement(self, pixels: float) -> float:
+        """Return the length that displaces landmarks by so much; zero if there are too few."""
+        return 0.0 if self.is_new else (
+            self._window.length_of_displacement(pixels) * self._filter.factor)
+
     def of_step(self, span_ns: tuple[int, int], current: View, relative: RelativePose) -> Step:
         """
         Return the step of an estimated motion from the newest frame of the track, with its length.
@@ -195,6 +206,14 @@ class TrackScale:
                                        as_measured=True)
         length = self._filter.scaled(addition.length, sigma, usable)
         return self._continued(relative, length, addition)
+
+    def preview(self, span_ns: tuple[int, int], current: View, relative: RelativePose) -> Step:
+        """Return the step to a frame that does not become part of the track."""
+        if self.is_new:
+            return Step(relative, self.expected_length(span_ns))
+        track = copy(self)
+        track._window, track._filter = self._window.copied(), deepcopy(self._filter)
+        return track.of_step(span_ns, current, relative)
 
     def _continued(self, relative: RelativePose, length: Length, addition: WindowStep,
                    as_measured: bool = False) -> Step:

@@ -54,13 +54,14 @@ def motion_covariance(relative: RelativePose, length: Length) -> Array:
     return symmetric(covariance)
 
 
-def standstill_covariance(relative: RelativePose, length: Length) -> Array:
+def standstill_covariance(relative: RelativePose, length: Length, hidden: float = 0.0) -> Array:
     """
     Return the covariance (6, 6) of a standstill: a tenth of a usual length, and the rotation's.
 
-    length: of a usual translation; if it is unknown, so is a tenth of it.
+    length: of a usual translation; if it is unknown, so is a tenth of it. hidden: of one that
+    displaces pixels by no more than in a standstill: of a slow camera, that is more.
     """
-    sigma = 0.1 * length.value if length.known else UNKNOWN_LENGTH_SIGMA
+    sigma = max(0.1 * length.value, hidden) if length.known else UNKNOWN_LENGTH_SIGMA
     rotation = relative.covariance_6[:3, :3]
     if not np.isfinite(rotation).all():
         # A standstill bounds the rotation as well as a displacement of about a pixel does.

@@ -31,7 +31,7 @@ from djet_ros.odometry.priors import MotionPriors, Span
 from djet_ros.odometry.result import camera_motion, OdometryResult
 from djet_ros.odometry.scale import Length, scale_source, ScaleSource
 from djet_ros.odometry.standstill import Standstill
-from djet_ros.odometry.structure import ambiguous, Step, TrackScale
+from djet_ros.odometry.structure import ambiguous, TrackScale
 from djet_ros.odometry.trajectory import Trajectory
 from djet_ros.odometry.uncertainty import (
     motion_covariance,
@@ -40,12 +40,16 @@ from djet_ros.odometry.uncertainty import (
 )
 import numpy as np
 
-# chosen: share of the image's larger side. A reference that waits for parallax is kept up to this
-# median displacement of the matches; nearly all of its image is still in view then.
+# chosen: share of the image's larger side. A reference is kept for a longer step up to this median
+# displacement of the matches; nearly all of its image is still in view then.
 _IN_VIEW = 0.05
 
 # Nanoseconds; chosen: a camera that creeps for longer is taken to have stood still until now.
 _LONGEST_CREEP_NS = 2_000_000_000
+
+# Nanoseconds; chosen: for so long a reference is kept for a longer step of a track. A camera that
+# stops after a short one would not be seen to stand.
+_LONGEST_WAIT_NS = 2_000_000_000
 
 # Nanoseconds; chosen: for so long a start of motion that the gyro does not measure is doubted. A
 # lorry that passes at walking pace has left the image by then.
@@ -56,14 +60,15 @@ class VisualOdometry:
     """
     Estimates each frame's motion from a reference frame, and integrates the motions.
 
-    The reference frame is the newest tracked frame, with three exceptions:
+    The reference frame is the newest tracked frame, with four exceptions:
     * A bad pair keeps it, so that the next good pair bridges single bad frames. After max_lost bad
       pairs in a row each frame becomes the reference until a pair is good; the missing motion is
       in the pose's covariance. A pair with two possible motions (UNDECIDED) does not keep it, as
       its images are good.
-    * A standstill keeps it, so that noise does not accumulate. So does a pair without parallax
-      while there are no landmarks and most of the reference image is in view, so that slow motion
-      accumulates until its direction can be estimated.
+    * A standstill keeps it, so that noise does not accumulate.
+    * While most of its image is in view, slow motion keeps it and accumulates: without parallax,
+      if new landmarks are needed, until its direction can be estimated; with two motions that the
+      pair before may tell apart, until it does.
     * A gap of more than max_gap, another image size or another camera starts a new reference at
       the last pose. A step back in time resets everything.
     """
@@ -116,6 +121,8 @@ class VisualOdometry:
         self._forget_distortion()
         self._last_pair: RelativePose | None = None
         self._bad_pairs = self._priors.known_ns = 0
+        # Whether the last frame moved, and its reference was kept.
+        self._waited = False
         self._standstill, self._trajectory = Standstill(), Trajectory()
 
     @property
@@ -169,7 +176,10 @@ class VisualOdometry:
             pair = self._estimated(view, priors)
             stands = self._stands(pair, at_rest)
         self._scale_source.observe(*span, reference.view, view, pair)
-        if stands:
+        # Back at a reference that was kept the camera does not stand: it swings, or has just
+        # stopped.
+        returned, self._waited = stands and self._waited, False
+        if stands and not returned:
             return self._stationary(frame, pair, span)
         # Verify the pair by the landmarks' depths and the gyro, and fuse the gyro's rotation.
         pair = self._verified(view, pair, priors, span)
@@ -178,6 +188,7 @@ class VisualOdometry:
         if pair.status not in TRACKED:
             return self._lost(frame, view, pair, span)
         # Estimate the length of its translation, and integrate it.
+        self._waited = not returned and self._waits_for_parallax(pair, span)
         return self._tracked(frame, view, pair, span)
 
     def _standing(self, view: View, priors: KnownMotion, at_rest: bool | None
@@ -272,7 +283,8 @@ class VisualOdometry:
     def _stationary(self, frame: Frame, pair: RelativePose, span: Span) -> OdometryResult:
         """Keep the pose and the reference."""
         length = self._scale.expected_length(span)
-        covariance = standstill_covariance(pair, length)
+        covariance = standstill_covariance(
+            pair, length, self._scale.length_of_displacement(self._config.standstill))
         result = replace(
             self._result(frame, pair, length, np.eye(4), covariance,
                          self._trajectory.stayed(covariance), keyframe=False),
@@ -291,14 +303,15 @@ class VisualOdometry:
 
     def _lost(self, frame: Frame, view: View, pair: RelativePose, span: Span) -> OdometryResult:
         """Hold the pose, and give up the reference after too many bad pairs."""
-        self._bad_pairs += 1
-        given_up = self._bad_pairs >= self._config.max_lost
+        waits = self._waits_for_decision(pair, span)
+        self._bad_pairs += not waits
+        given_up = not waits and self._bad_pairs >= self._config.max_lost
         length = self._scale.expected_length(span)
         motion, covariance = (self._priors.dead_reckoned(span)
                               or _rotation_at_most(pair, length))
         trajectory = self._trajectory.moved(motion, covariance)
         result = self._result(frame, pair, length, motion, covariance, trajectory)
-        if given_up or pair.status in UNDECIDED:
+        if given_up or (pair.status in UNDECIDED and not waits):
             if given_up:
                 self._scale.begin(view)
             else:
@@ -311,15 +324,14 @@ class VisualOdometry:
     def _tracked(self, frame: Frame, view: View, pair: RelativePose,
                  span: Span) -> OdometryResult:
         """Integrate the motion; the frame is the next reference unless that waits for parallax."""
-        waits = self._waits_for_parallax(pair)
-        step = (Step(pair, self._scale.expected_length(span)) if waits
+        step = (self._scale.preview(span, view, pair) if self._waited
                 else self._scale.of_step(span, view, pair))
         trajectory = self._trajectory.moved_by_step(step)
         result = self._result(
             frame, pair, step.length, camera_motion(step.relative, step.length.value),
             motion_covariance(step.relative, step.length), trajectory,
-            keyframe=not waits and self._scale.keyframe)
-        if not waits:
+            keyframe=not self._waited and self._scale.keyframe)
+        if not self._waited:
             self._trajectory = trajectory
             self._refer_to(frame, view, pair)
         self._last_pair, self._bad_pairs, self._priors.known_ns = pair, 0, frame.stamp_ns
@@ -328,10 +340,24 @@ class VisualOdometry:
             self._undistort(k1)
         return result
 
-    def _waits_for_parallax(self, pair: RelativePose) -> bool:
+    def _waits_for_parallax(self, pair: RelativePose, span: Span) -> bool:
         """Return whether the reference is kept until the direction of motion is determined."""
-        if pair.status is not Status.NO_PARALLAX or not self._scale.is_new:
+        if pair.status is not Status.NO_PARALLAX or not self._scale.needs_parallax:
             return False
+        return self._is_in_view(pair) and (self._scale.is_new or _is_short(span))
+
+    def _waits_for_decision(self, pair: RelativePose, span: Span) -> bool:
+        """
+        Return whether the reference is kept until the pair before it decides between motions.
+
+        The longer the step, the clearer the depths of both.
+        """
+        before = self._reference.pair
+        return (pair.status is Status.AMBIGUOUS and before is not None and bool(before.t.any())
+                and self._is_in_view(pair) and _is_short(span))
+
+    def _is_in_view(self, pair: RelativePose) -> bool:
+        """Return whether most of the reference image is in view."""
         displacements = norms(pair.y - pair.x)
         return bool(np.median(displacements) < _IN_VIEW * max(self._reference.view.gray.shape))
 
@@ -373,6 +399,11 @@ class VisualOdometry:
             frame, self._reference, pair, length, motion, covariance, trajectory.pose,
             trajectory.path.pose, None if self._scale.keyframe is None else keyframe,
             self._estimator.k1)
+
+
+def _is_short(span: Span) -> bool:
+    """Return whether a camera that has hardly moved in a span may still be moving."""
+    return span[1] - span[0] < _LONGEST_WAIT_NS
 
 
 def _motion_alone(pair: RelativePose | None) -> RelativePose | None:
