@@ -1,0 +1,96 @@
+"""
+A slow camera: as most are that send thirty or sixty images in a second.
+
+From image to image it moves by little more than the noise; what single pairs do not tell, longer
+steps and landmarks do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from djet_ros.core.geometry import direction_angle, rotation_angle
+from djet_ros.core.types import Array, Status
+from djet_ros.lab.scenes.catalogue import make_scene
+from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.result import OdometryResult
+from djet_ros.odometry.visual_odometry import VisualOdometry
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, Slerp
+
+PERIOD_NS = 33_000_000
+
+
+def slowed(poses: Array, factor: int) -> Array:
+    """Return poses (M, 4, 4) with so many steps in place of each between some (N, 4, 4)."""
+    whole = np.arange(len(poses))
+    times = np.arange((len(poses) - 1) * factor + 1) / factor
+    finer = np.tile(np.eye(4), (len(times), 1, 1))
+    finer[:, :3, :3] = Slerp(whole, Rotation.from_matrix(poses[:, :3, :3]))(times).as_matrix()
+    finer[:, :3, 3] = CubicSpline(whole, poses[:, :3, 3])(times)
+    return finer
+
+
+def seen_slowly(name: str, seed: int, factor: int, frames: range
+                ) -> Iterator[tuple[OdometryResult, Array, Array]]:
+    """Replay some frames of a slowed path; yield results, true motions, and true poses (4, 4)."""
+    scene, odometry = make_scene(name, seed), VisualOdometry()
+    path = slowed(scene.trajectory(frames.stop // factor + 2), factor)
+    for index in frames:
+        result = odometry.process(Frame(scene.render(path[index], index), scene.K,
+                                        index * PERIOD_NS))
+        before = index if result.previous_stamp_ns is None else round(
+            result.previous_stamp_ns / PERIOD_NS)
+        yield (result, np.linalg.inv(path[before]) @ path[index],
+               np.linalg.inv(path[frames.start]) @ path[index])
+
+
+def direction_error(result: OdometryResult, motion: Array) -> float:
+    """Return the error in degrees of the direction of an estimated motion (4, 4)."""
+    return float(np.degrees(direction_angle(result.motion[:3, 3], motion[:3, 3])))
+
+
+@pytest.mark.slow
+def test_over_a_seafloor_it_is_not_led_to_the_other_motion_of_a_plane() -> None:
+    """With a quarter of the usual step the floor is flat, to within the noise of a pair."""
+    statuses = []
+    for result, motion, _ in seen_slowly('underwater', 20, 4, range(50, 57)):
+        statuses.append(result.status)
+        if result.status is Status.OK:
+            assert direction_error(result, motion) < 2
+    assert statuses[-1] is Status.OK
+
+
+@pytest.mark.slow
+def test_over_a_plane_it_waits_until_two_motions_can_be_told_apart() -> None:
+    """With an eighth of the usual step neither depths nor chirality tell them apart at once."""
+    waited = 0
+    for result, motion, pose in seen_slowly('flight', 20, 8, range(60)):
+        if result.status is Status.OK:
+            assert direction_error(result, motion) < 3
+        waited += result.status is Status.AMBIGUOUS
+        turned = np.degrees(rotation_angle(result.pose[:3, :3], pose[:3, :3]))
+    assert waited > 5 and turned < 0.5
+
+
+@pytest.mark.slow
+def test_in_a_slow_hand_new_landmarks_replace_those_that_leave_the_view() -> None:
+    """Each pair is a rotation to within its noise, which differs from the true one by 0.08."""
+    lengths = []
+    for result, _, pose in seen_slowly('handheld', 21, 8, range(100)):
+        assert result.status in (Status.FIRST_FRAME, Status.OK, Status.NO_PARALLAX)
+        assert np.degrees(rotation_angle(result.pose[:3, :3], pose[:3, :3])) < 0.15
+        lengths.append((np.linalg.norm(result.pose[:3, 3]), np.linalg.norm(pose[:3, 3])))
+    estimated, true = np.array(lengths[10:]).T
+    scale = estimated / true
+    assert scale.max() / scale.min() < 1.06
+
+
+@pytest.mark.slow
+def test_on_a_street_its_first_step_counts() -> None:
+    """Nothing tells at first that it does not stand, but that points move by any amount."""
+    for result, motion, _ in seen_slowly('road', 20, 16, range(4)):
+        if result.status is not Status.FIRST_FRAME:
+            assert result.status is Status.OK and direction_error(result, motion) < 1
