@@ -17,6 +17,7 @@ import argparse
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
+from itertools import product
 import json
 import os
 from pathlib import Path
@@ -82,6 +83,8 @@ WRONG, PLACES = (360.0, 2000.0), 8
 # leave the image in that time.
 COVERED = 12
 WITH_LORRIES, LORRIES_PASS_IN = ('moving_object', 'motorway', 'traffic'), 120
+# Frames of a hand-held camera, and how much slower it also moves: as at eighty images a second.
+SLOW_FRAMES, SLOWER = 100, 8
 # Second value of estimator.calibration_sigma for real cameras, in pixels: the standard deviation
 # if it is unknown whether pixel centres are at integers or at halves.
 CALIBRATED = '0.25'
@@ -309,9 +312,10 @@ def short_ways(place: Path, args: argparse.Namespace) -> dict[str, Any]:
         sources[name.replace('0–', '15–')] = bag
     sources |= {f'TUM {folder.name.removeprefix("rgbd_dataset_")}': folder
                 for folder in sorted(args.data.glob('tum/*/'))}
-    for seed in range(3):
-        sources[f'rendered `handheld`, seed {seed}, 100 frames'] = render_sequence(
-            'handheld', place / f'seed{seed}', 100, seed)
+    for seed, slower in product(range(3), (1, SLOWER)):
+        name = f'rendered `handheld`, seed {seed}, {SLOW_FRAMES} frames'
+        sources[name if slower == 1 else f'{name}, 1/{slower} of the speed'] = render_sequence(
+            'handheld', place / f'seed{seed}-{slower}', SLOW_FRAMES, seed, slower=slower)
     rows = []
     for name, source in sources.items():
         djet('replay', source, '--output', place / 'replay', '--overwrite')

@@ -146,6 +146,18 @@ def test_standing_still_only_the_noise_changes() -> None:
     np.testing.assert_array_equal(quiet.render(poses[0], 0), quiet.render(poses[1], 1))
 
 
+@pytest.mark.parametrize('name', ['road', 'handheld'])
+def test_a_slower_camera_takes_the_same_path(name: str) -> None:
+    usual, slower = make_scene(name), make_scene(name, slower=8)
+    poses, more = usual.trajectory(6), slower.trajectory(41)
+    assert np.allclose(more[::8], poses)
+    assert slower.path.limit == 8 * (usual.path.limit - 1) + 1
+    steps = np.linalg.norm(np.diff(more[:, :3, 3], axis=0), axis=1)
+    usual_steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    assert np.abs(np.diff(steps)).max() < 0.3 * usual_steps.max() / 8
+    assert steps.sum() == pytest.approx(usual_steps.sum(), rel=0.01)
+
+
 def test_turning_on_the_spot_there_is_no_translation() -> None:
     poses = make_scene('rotation', size=TINY).trajectory(30)
     np.testing.assert_allclose(poses[:, :3, 3], 0, atol=1e-12)
@@ -225,6 +237,7 @@ def test_a_folder_that_was_not_rendered_is_never_replaced(tmp_path: Path) -> Non
     ({'name': 'raod'}, "no scene 'raod'; choose from road, underwater"),
     ({'name': 'road', 'size': (20000, 376)}, 'size is 20000x376'),
     ({'name': 'road', 'seed': -1}, 'seed is -1'),
+    ({'name': 'road', 'slower': 0}, 'slower is 0'),
     ({'name': 'road', 'frames': 0, 'size': TINY}, "--frames is 0; scene 'road' has 1 to "),
     ({'name': 'road', 'frames': 10 ** 9, 'size': TINY}, '--frames is 1000000000'),
 ])

@@ -45,6 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--size', type=_size, metavar='WxH',
                         help='image size in pixels (default: depends on the scene: 1241x376 as in '
                              'KITTI, 960x540 or 640x480)')
+    parser.add_argument('--slower', type=int, default=1, metavar='N',
+                        help='number of steps of the camera in place of each (default: '
+                             '%(default)s)')
     imu = parser.add_argument_group('IMU')
     for name, text in _MEMS.items():
         imu.add_argument(f'--{name.replace("_", "-")}', dest=f'mems.{name}', type=float,
@@ -57,7 +60,8 @@ def run(args: argparse.Namespace) -> int:
     """Render, with a progress bar on stderr, and print what was written."""
     with progress_bar(args.scene) as progress:
         folder = render_sequence(args.scene, args.out, args.frames, args.seed, args.size,
-                                 progress, overwrite=args.overwrite, mems=_mems(args))
+                                 progress, overwrite=args.overwrite, mems=_mems(args),
+                                 slower=args.slower)
     frames = len(list((folder / 'image_0').iterdir()))
     width, height = args.size or SCENES[args.scene].size
     print(f'{folder}: {frames} frames of {width}x{height} with ground truth')

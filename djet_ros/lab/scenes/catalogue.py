@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 
 from djet_ros.core.types import Array
@@ -39,6 +39,7 @@ from djet_ros.lab.scenes.route import (
 )
 from djet_ros.lab.scenes.scene import Scene
 from djet_ros.lab.scenes.seafloor import seafloor
+from djet_ros.lab.scenes.slow import Slower
 from djet_ros.lab.scenes.street import street
 from djet_ros.lab.scenes.street_objects import make_palette, Palette, truck
 import numpy as np
@@ -70,8 +71,13 @@ class Entry:
     parallax: bool = True
 
 
-def make_scene(name: str, seed: int = 0, size: tuple[int, int] | None = None) -> Scene:
-    """Return the scene of a name; raise DjetError for an unknown name or invalid size or seed."""
+def make_scene(name: str, seed: int = 0, size: tuple[int, int] | None = None,
+               slower: int = 1) -> Scene:
+    """
+    Return the scene of a name; raise DjetError for an unknown name or invalid size or seed.
+
+    slower: number of steps of the camera in place of each usual one.
+    """
     entry = find(name)
     width, height = size = size or entry.size
     if not (_SMALLEST <= width <= _LARGEST and _SMALLEST <= height <= _LARGEST):
@@ -79,7 +85,10 @@ def make_scene(name: str, seed: int = 0, size: tuple[int, int] | None = None) ->
                         f'{_SMALLEST} and {_LARGEST} pixels')
     if seed < 0:
         raise DjetError(f'--seed is {seed}; it must not be negative')
-    return entry.build(seed, size)
+    if slower < 1:
+        raise DjetError(f'--slower is {slower}; it must be at least 1')
+    scene = entry.build(seed, size)
+    return scene if slower == 1 else replace(scene, path=Slower(scene.path, slower))
 
 
 def find(name: str) -> Entry:

@@ -26,24 +26,25 @@ _LABEL = 'scene.txt'
 def render_sequence(name: str, out: Path, frames: int | None = None, seed: int = 0,
                     size: tuple[int, int] | None = None,
                     progress: Callable[[int, int], None] | None = None, *,
-                    overwrite: bool = False, mems: Mems | None = None) -> Path:
+                    overwrite: bool = False, mems: Mems | None = None, slower: int = 1) -> Path:
     """
     Render a named scene into ``out/sequences/NN`` and its ground truth into ``out/poses/NN.txt``.
 
     frames, size (width, height): by default those of the catalogue; progress is called with
     (frames done, total); mems: errors of the IMU, whose samples are written to imu.csv if there
-    are at least three frames. Returns the sequence's folder. Raises DjetError if it exists,
-    unless ``overwrite``, or can't be written. Times and poses are written last, so that an
-    interrupted rendering is not mistaken for a complete one.
+    are at least three frames; slower: see ``make_scene``. Returns the sequence's folder. Raises
+    DjetError if it exists, unless ``overwrite``, or can't be written. Times and poses are written
+    last, so that an interrupted rendering is not mistaken for a complete one.
     """
-    scene, number = make_scene(name, seed, size), find(name).number
+    scene, number = make_scene(name, seed, size, slower), find(name).number
     poses = scene.trajectory(frames if frames is not None else suggested_frames(scene))
     folder = out / 'sequences' / f'{number:02d}'
     truth = out / 'poses' / f'{number:02d}.txt'
     try:
         _clear(folder, truth, overwrite)
         (folder / _LABEL).write_text(f'djet render {name}: seed {seed}, {len(poses)} frames, '
-                                     f'{scene.size[0]}x{scene.size[1]}\n', 'utf-8')
+                                     f'{scene.size[0]}x{scene.size[1]}, 1/{slower} of the '
+                                     'usual speed\n', 'utf-8')
         (folder / 'calib.txt').write_text(
             f'P0: {_projection(scene.K)}\nTr_imu_to_cam: {_projection(TO_CAMERA)}\n',
             'utf-8')
