@@ -171,13 +171,23 @@ class TwoViewEstimator:
         alone = self._estimate_alone(pair, followed)
         if alone is None:
             return self.estimate_pair(pair)
-        K, before, continued = pair.current.K, pair.prior, is_continued(pair.prior, alone)
-        reliable = _within_limits(alone, _limits_from(prior))
+        K = pair.current.K
         left_out = motion_left_out(alone, K)
         if is_left_out_world(alone, K, left_out):
             return self.estimate_pair(
                 replace(pair, prior=None, predicted=None, limits=Limits()))
+        reliable = _within_limits(alone, _limits_from(prior))
         alone = replace(alone, left_out=~alone.of_body & ~readmitted(alone, K, left_out))
+        return self._of_followed_or_all(pair, alone, reliable)
+
+    def _of_followed_or_all(self, pair: Pair, alone: RelativePose, reliable: bool
+                            ) -> RelativePose:
+        """
+        Return the estimate by the followed matches alone, or that by all.
+
+        reliable: whether the former fit as well as the pair before did.
+        """
+        before, continued = pair.prior, is_continued(pair.prior, alone)
         sure = reliable and continued and before is not None and not before.undecided
         if sure and not fits_followed_body(alone):
             return alone
