@@ -394,6 +394,12 @@ def test_printed_table_is_short_and_names_the_plot(replayed):
     assert 'rotation' in done.stdout
     assert done.stdout.rstrip().endswith(str(results / 'trajectory.png'))
     assert len(done.stdout.splitlines()) < 25
+    # Millimetres of a path of a few metres are not rounded away.
+    positions = json.loads((results / 'summary.json').read_text())['positions']
+    printed = re.search(r'(\S+) m over a path of (\S+) m', done.stdout)
+    assert printed is not None
+    assert [float(length) for length in printed.groups()] == pytest.approx(
+        [positions['rmse_m'], positions['way_m']], rel=1e-3)
     assert cv2.imread(str(results / 'trajectory.png')).shape[0] > 300
 
 

@@ -22,6 +22,7 @@ from djet_ros.odometry.scale import Scale
 from djet_ros.recordings.recording import AUXILIARY, open_recording
 from djet_ros.replay.replay import Outcome, Replay
 from djet_ros.replay.results import DEBUG, PLOT, ResultsFolder
+import numpy as np
 from rich.table import Table
 
 DESCRIPTION = """\
@@ -156,7 +157,8 @@ def _table(summary: dict[str, Any]) -> Table:
         table.add_row('  translation direction', spread(summary['translation_error_deg']))
     if positions := summary.get('positions'):
         table.add_row('position RMSE after alignment (APE)',
-                      f"{positions['rmse_m']:.3f} m over a path of {positions['way_m']:.1f} m")
+                      f"{_metres(positions['rmse_m'])} over a path of "
+                      f"{_metres(positions['way_m'])}")
         if positions['scale_change'] is not None:
             table.add_row('  scale drift, end / start', f"{positions['scale_change']:.3f}")
     if drift := summary.get('drift'):
@@ -166,3 +168,8 @@ def _table(summary: dict[str, Any]) -> Table:
         if drift['translation_percent'] is not None:
             table.add_row('  translation (t_rel)', f"{drift['translation_percent']:.2f} %")
     return table
+
+
+def _metres(length: float) -> str:
+    """Return a length with four significant digits, as a hand or a car may have moved."""
+    return f"{np.format_float_positional(length, 4, fractional=False, trim='-')} m"
