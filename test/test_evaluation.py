@@ -462,11 +462,11 @@ UNHEARD = """
 from concurrent.futures import Future
 from signal import pthread_kill, SIGINT
 from threading import get_ident, Timer
-from djet_ros.lab.runner import _as_completed
+from djet_ros.lab.runner import as_completed
 
 Timer(0.5, lambda: pthread_kill(get_ident(), SIGINT)).start()
 try:
-    list(_as_completed([Future()]))
+    list(as_completed([Future()]))
 except KeyboardInterrupt:
     print('heard')
 """

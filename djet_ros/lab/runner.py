@@ -70,7 +70,7 @@ def run(executor: Executor, chunks: Sequence[C], work: Callable[[C], list[R]],
     progress(done, total)
     futures = {executor.submit(work, chunk): chunk for chunk in missing}
     try:
-        for future in _as_completed(futures):
+        for future in as_completed(futures):
             chunk = futures[future]
             store.add(chunk.name, future.result())
             done += chunk.count
@@ -83,7 +83,7 @@ def run(executor: Executor, chunks: Sequence[C], work: Callable[[C], list[R]],
     return in_order(store, (chunk.name for chunk in chunks))
 
 
-def _as_completed(futures: Iterable[Future[R]]) -> Iterator[Future[R]]:
+def as_completed(futures: Iterable[Future[R]]) -> Iterator[Future[R]]:
     """
     Yield futures as they complete.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from concurrent.futures import as_completed, Executor
+from concurrent.futures import Executor
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -39,7 +39,7 @@ from djet_ros.lab.coverage import (
 )
 from djet_ros.lab.methods import check_names
 from djet_ros.lab.pairs import FAILURE
-from djet_ros.lab.runner import chunks_of, local_workers, run as run_chunks
+from djet_ros.lab.runner import as_completed, chunks_of, local_workers, run as run_chunks
 from djet_ros.lab.scenes import render_sequence, SCENES
 from djet_ros.lab.sequences import Dataset
 from djet_ros.lab.store import RecordStore
