@@ -5,10 +5,8 @@ from dataclasses import replace
 from djet_ros.core.bodies import (
     continuing_motion,
     fits_followed_body,
-    is_left_out_world,
-    motion_left_out,
+    LeftOut,
     of_followed_body,
-    readmitted,
 )
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.geometry import (
@@ -205,8 +203,7 @@ def test_static_matches_are_readmitted_and_those_of_a_lorry_are_not(seed: int) -
     seen = Overtaking(seed)
     # A third of the static world was left out with the lorry.
     left_out = seen.of_lorry | (seen.of_static & (np.arange(len(seen.x)) % 3 == 0))
-    pair = seen.pair(seen.static, left_out)
-    back = readmitted(pair, K, motion_left_out(pair, K))
+    back = LeftOut(seen.pair(seen.static, left_out), K).readmitted()
     assert not (back & ~left_out).any()
     # The others fit the motion of the lorry too, by chance.
     assert back[seen.of_static & left_out].mean() > 0.4
@@ -218,11 +215,11 @@ def test_depths_tell_that_a_lorry_was_followed_and_the_world_left_out(seed: int)
     seen = Overtaking(seed)
     of_lorry, of_static = (seen.pair(pose, ~of_it) for pose, of_it in (
         (seen.lorry, seen.of_lorry), (seen.static, seen.of_static)))
-    assert is_left_out_world(of_lorry, K, motion_left_out(of_lorry, K))
-    assert not is_left_out_world(of_static, K, motion_left_out(of_static, K))
+    assert LeftOut(of_lorry, K).is_world()
+    assert not LeftOut(of_static, K).is_world()
     # Too few to tell.
-    few = seen.pair(seen.lorry, np.arange(len(seen.x)) < 10)
-    assert motion_left_out(few, K) is None and not is_left_out_world(few, K, None)
+    few = LeftOut(seen.pair(seen.lorry, np.arange(len(seen.x)) < 10), K)
+    assert few.motion is None and not few.is_world()
 
 
 def test_a_lorry_as_fast_as_the_camera_fits_its_motion() -> None:

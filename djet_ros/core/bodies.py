@@ -107,41 +107,43 @@ def fits_followed_body(pair: RelativePose) -> bool:
     return bool(2 * fitting.sum() > len(fitting))
 
 
-def motion_left_out(pair: RelativePose, K: Array) -> Pose | None:
-    """Return the motion of the matches that a pair left out, None if they are too few for one."""
-    chosen = np.flatnonzero(~pair.of_body)
-    if len(chosen) < _FEWEST:
-        return None
-    return fit_motion(_reprojection(pair, K).subset(chosen), Pose(pair.R, pair.t), _noise(pair))
-
-
-def readmitted(pair: RelativePose, K: Array, other: Pose | None) -> NDArray[np.bool_]:
+class LeftOut:
     """
-    Return which matches (N,) a pair left out that are not of another body after all.
+    The matches of a pair, some of which it left out, and the motion of those.
 
-    They fit the motion of the pair, and not that of the other body. All if they are too few for a
-    body. K: (3, 3); other: its motion, see ``motion_left_out``.
+    K: (3, 3) camera matrix; motion: None if they are too few for a body.
     """
-    chosen = ~pair.of_body
-    if other is None:
-        return chosen
-    of_other = np.abs(_residuals(_reprojection(pair, K), other)) < INLIER * _noise(pair)
-    return np.asarray(chosen & (_errors(pair) < INLIER) & ~of_other)
 
+    def __init__(self, pair: RelativePose, K: Array) -> None:
+        self._pair, self._noise = pair, _noise(pair)
+        self._problem = jet_problem(
+            K, pair.x, ReprojectionSurface(pair.x, pair.y).fit_around(pair.y))
+        chosen = np.flatnonzero(~pair.of_body)
+        self.motion = None if len(chosen) < _FEWEST else fit_motion(
+            self._problem.subset(chosen), Pose(pair.R, pair.t), self._noise)
 
-def is_left_out_world(pair: RelativePose, K: Array, other: Pose | None) -> bool:
-    """
-    Return whether the matches that a pair left out are the static world, as their depths tell.
+    def readmitted(self) -> NDArray[np.bool_]:
+        """
+        Return which of them (N,), of all matches, are not of another body after all.
 
-    The pair before may have followed a moving object. K, other: as for ``readmitted``.
-    """
-    return other is not None and is_static_world(
-        _reprojection(pair, K), other, Pose(pair.R, pair.t), _noise(pair))
+        They fit the motion of the pair, and not that of the other body. All if they are too few
+        for a body.
+        """
+        chosen = ~self._pair.of_body
+        if self.motion is None:
+            return chosen
+        of_other = np.abs(_residuals(self._problem, self.motion)) < INLIER * self._noise
+        return np.asarray(chosen & (_errors(self._pair) < INLIER) & ~of_other)
 
+    def is_world(self) -> bool:
+        """
+        Return whether they are the static world, as their depths tell.
 
-def _reprojection(pair: RelativePose, K: Array) -> JetProblem:
-    """Return the problem of the re-projection errors of all matches of a pair."""
-    return jet_problem(K, pair.x, ReprojectionSurface(pair.x, pair.y).fit_around(pair.y))
+        The pair before may have followed a moving object.
+        """
+        followed = Pose(self._pair.R, self._pair.t)
+        return self.motion is not None and is_static_world(
+            self._problem, self.motion, followed, self._noise)
 
 
 class Continuing(NamedTuple):

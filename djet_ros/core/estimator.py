@@ -12,10 +12,8 @@ from djet_ros.core.basins import BASIN_TUNING
 from djet_ros.core.bodies import (
     fits_followed_body,
     is_continued,
-    is_left_out_world,
-    motion_left_out,
+    LeftOut,
     of_followed_body,
-    readmitted,
 )
 from djet_ros.core.corners import detect_corners, detect_large_corners
 from djet_ros.core.covariance import is_within, pose_difference
@@ -171,13 +169,12 @@ class TwoViewEstimator:
         alone = self._estimate_alone(pair, followed)
         if alone is None:
             return self.estimate_pair(pair)
-        K = pair.current.K
-        left_out = motion_left_out(alone, K)
-        if is_left_out_world(alone, K, left_out):
+        left_out = LeftOut(alone, pair.current.K)
+        if left_out.is_world():
             return self.estimate_pair(
                 replace(pair, prior=None, predicted=None, limits=Limits()))
         reliable = _within_limits(alone, _limits_from(prior))
-        alone = replace(alone, left_out=~alone.of_body & ~readmitted(alone, K, left_out))
+        alone = replace(alone, left_out=~alone.of_body & ~left_out.readmitted())
         return self._of_followed_or_all(pair, alone, reliable)
 
     def _of_followed_or_all(self, pair: Pair, alone: RelativePose, reliable: bool

@@ -177,7 +177,7 @@ class Window:
         self.lens = lens or SelfCalibration.unknown(view.K, view.gray.shape)
         self._poses = Poses(np.eye(3)[None], np.zeros((1, 3)), self.lens.residual_k1)
         self._is_keyframe, self._has_landmarks = [True], [False]
-        # Whether the newest frame would be a keyframe if it had parallax; and whether the one
+        # Whether the newest frame would be a keyframe, but has no parallax; and whether the one
         # before it has just become one.
         self._is_due = self._became_keyframe = False
         self._landmarks = Landmarks.at(np.empty((0, 2)), np.empty(0), 0, 1)
@@ -213,7 +213,7 @@ class Window:
 
         Which needs parallax between the two.
         """
-        return self.is_new or (self._is_due and not self._is_keyframe[-1])
+        return self.is_new or self._is_due
 
     @property
     def is_keyframe(self) -> bool:
@@ -233,8 +233,7 @@ class Window:
                             else self._length(view, relative, guess))
         self._cached_lengths = None
         # New landmarks are created from a keyframe and a frame after it, with parallax.
-        self._became_keyframe = bool(
-            relative.t.any() and self._is_due and not self._is_keyframe[-1])
+        self._became_keyframe = bool(self._is_due and relative.t.any())
         self._is_keyframe[-1] |= self._became_keyframe
         self._append(view, relative, length)
         self._add_pair(relative, length, expected)
@@ -263,8 +262,9 @@ class Window:
             self._marginalise_landmarks(self._landmarks.anchors == 0)
             self._marginalise_frame(0)
         # Without parallax new keyframes would only drop landmarks.
-        self._is_due = self._lacks_landmarks()
-        self._is_keyframe[-1] |= bool(self._is_due and relative.t.any())
+        lacking = not self._is_keyframe[-1] and self._lacks_landmarks()
+        self._is_keyframe[-1] |= bool(lacking and relative.t.any())
+        self._is_due = lacking and not self._is_keyframe[-1]
         self._latest = (relative, addition.length) if relative.t.any() else None
         return addition
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from djet_ros.core.types import Array
 from djet_ros.lab.scenes.route import Trajectory
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 
@@ -34,21 +35,11 @@ class Slower:
         if part == 0:
             return before
         after, share = self.path.pose(whole + 1), part / self.steps
-        around = [self.path.pose(max(whole - 1, 0)), before, after,
-                  self.path.pose(min(whole + 2, self.path.limit - 1))]
+        around = np.array([self.path.pose(min(max(near, 0), self.path.limit - 1))[:3, 3]
+                           for near in range(whole - 1, whole + 3)])
         pose = np.eye(4)
         turns = Rotation.from_matrix([before[:3, :3], after[:3, :3]])
         pose[:3, :3] = Slerp([0, 1], turns)(share).as_matrix()
-        pose[:3, 3] = _spline(share) @ [each[:3, 3] for each in around]
+        velocities = (around[2:] - around[:-2]) / 2
+        pose[:3, 3] = CubicHermiteSpline([0, 1], around[1:3], velocities)(share)
         return pose
-
-
-def _spline(share: float) -> Array:
-    """
-    Return the weights (4,) of four points for a share of the way from the second to the third.
-
-    Catmull and Rom, "A class of local interpolating splines", 1974.
-    """
-    powers = share ** np.arange(4.0)
-    return np.asarray(powers @ [[0, 1, 0, 0], [-0.5, 0, 0.5, 0], [1, -2.5, 2, -0.5],
-                                [-0.5, 1.5, -1.5, 0.5]])
