@@ -164,7 +164,7 @@ def test_a_converted_sequence_reads_back(small_kitti, tmp_path, storage):
             assert time.sec * SECOND + time.nanosec == stamp
         picture = picture.message
         assert (picture.encoding, picture.step) == ('mono8', 64)
-        assert (picture.data.reshape(48, 64) == sequence.image(i)).all()
+        assert (picture.data.reshape(48, 64) == sequence.raw(i)).all()
         assert camera.message.k.tolist() == sequence.K.ravel().tolist()
         assert (camera.message.width, camera.message.height) == (64, 48)
         assert truth.message.pose.position.z == sequence.poses[i][2, 3]

@@ -126,7 +126,7 @@ def test_a_distorted_sequence_is_replayed_as_its_raw_images_with_their_distortio
     assert np.array_equal(gray_image(image), texture)
     camera = Camera.from_info(info, is_rectified('auto', recording.image_topic))
     assert camera.K.tolist() == K.tolist()
-    assert np.array_equal(camera.undistort(texture), euroc(asl).image(2))
+    assert np.array_equal(camera.corrected(texture), euroc(asl).image(2))
 
 
 def test_files_of_16_bits_are_replayed_at_full_depth(asl):

@@ -20,6 +20,7 @@ from djet_ros.core.features import detect_orb
 from djet_ros.core.geometry import direction_angle, rotation_angle, unit
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.lab.scenes.catalogue import make_scene
+from djet_ros.odometry.camera import Camera
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.visual_odometry import VisualOdometry
 import numpy as np
@@ -113,9 +114,10 @@ def drive(scene_name: str, change: Callable[[int, Gray], Gray] = lambda i, gray:
           keep: Callable[[int], bool] = lambda i: True, **estimator: object) -> Iterator[Outcome]:
     """Outcomes of a rendered drive, each pair against the truth between its two frames."""
     K, poses, images = rendered(scene_name)
-    odometry = VisualOdometry(preset('best', **estimator))
+    odometry, camera = VisualOdometry(preset('best', **estimator)), Camera(K, np.zeros(5), SIZE)
     for i in filter(keep, range(FRAMES)):
-        result = odometry.process(Frame(change(i, images[i]), K, (i + 1) * PERIOD_NS))
+        image = camera.corrected(change(i, images[i]))
+        result = odometry.process(Frame(image, K, (i + 1) * PERIOD_NS))
         check_messages(result)
         if result.previous_stamp_ns is None:
             continue
@@ -149,6 +151,16 @@ def bonneted(i: int, gray: Gray) -> Gray:
 def grainy(i: int, gray: Gray) -> Gray:
     return np.clip(np.rint(gray + np.random.default_rng(i).normal(0, 12, gray.shape)),
                    0, 255).astype(np.uint8)
+
+
+def with_broken_pixels(i: int, gray: Gray) -> Gray:
+    broken = np.random.default_rng(5).random(gray.shape) < 0.002
+    return np.where(broken, np.uint8(255), gray)
+
+
+def striped(i: int, gray: Gray) -> Gray:
+    of_columns = np.random.default_rng(6).normal(0, 6, gray.shape[1])
+    return np.clip(np.rint(gray + of_columns), 0, 255).astype(np.uint8)
 
 
 def compressed(i: int, gray: Gray) -> Gray:
@@ -189,6 +201,8 @@ KINDS: dict[str, Callable[[], Iterator[Outcome]]] = {
     'every third frame dropped': partial(drive, 'road', keep=lambda i: i % 3 != 1),
     'dim and hazy water, particles': partial(drive, 'underwater'),
     'noise of 12 gray levels': partial(drive, 'indoor', grainy),
+    'two pixels of a thousand broken': partial(drive, 'indoor', with_broken_pixels),
+    'columns that differ by 6 gray levels': partial(drive, 'indoor', striped),
     'JPEG of quality 40': partial(drive, 'indoor', compressed),
     '1 % of the matches wrong': lambda: wrong_matches(0.01),
     '50 % of the matches wrong': lambda: wrong_matches(0.5),

@@ -59,7 +59,7 @@ def extract(recording: BagRecording, folder: Path, warn: Warn = refuse) -> Path:
         elif topic == recording.ground_truth_topic:
             truth.add(*pose_of(message))
         elif camera is not None and (not stamps or stamp_ns(message.header) > stamps[-1]):
-            image = camera.undistort(gray_image(message))
+            image = camera.corrected(gray_image(message))
             (folder / f'{len(stamps):06d}.png').write_bytes(_png(image))
             stamps.append(stamp_ns(message.header))
     if camera is None or not stamps:

@@ -16,6 +16,7 @@ import cv2
 from djet_ros.core.types import Array
 from djet_ros.odometry.images import BadMessage, Gray
 from djet_ros.odometry.png import LARGEST_IMAGE_PIXELS
+from djet_ros.odometry.sensor_defects import without_defects
 import numpy as np
 from numpy.typing import NDArray
 
@@ -110,6 +111,10 @@ class Camera:
             check_lens(projection, _whole_size(info))
             pinhole = projection
         return cls(_of_image(K, info), D, size, model, _of_image(pinhole, info))
+
+    def corrected(self, raw: Gray) -> Gray:
+        """Return an image (H, W) `without_defects` and undistorted: what all poses are from."""
+        return self.undistort(without_defects(raw))
 
     def undistort(self, gray: Gray) -> Gray:
         """Return an undistorted image (H, W); raises BadMessage if its size is another one."""

@@ -73,6 +73,6 @@ class Preprocessor:
 def _preprocessed(message: Any, settings: Settings, with_view: bool) -> Preprocessed:
     camera, estimator, limits = settings
     raw = gray_image(message, limits)
-    gray = camera.undistort(raw)
+    gray = camera.corrected(raw)
     view = estimator.view(gray, camera.K, left_out=camera.unseen(raw.shape)) if with_view else None
     return Preprocessed(gray, raw.shape, view, few_levels(message, raw))

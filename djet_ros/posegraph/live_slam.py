@@ -266,7 +266,7 @@ class LiveSlam:
             return None
         try:
             raw = gray_image(message, self.config.odometry.gray_limits())
-            return Frame(camera.undistort(raw), camera.K, stamp, frame_of(message.header),
+            return Frame(camera.corrected(raw), camera.K, stamp, frame_of(message.header),
                          self._masks.of(stamp, raw.shape, camera))
         except BadMessage as problem:
             self._reject('image', problem)

@@ -36,7 +36,7 @@ def frame_finder(recording: Recording, config: Config) -> Callable[[int], Frame]
         for camera, message in images:
             if stamp_ns(message.header) == stamp:
                 raw = gray_image(message, config.odometry.gray_limits())
-                return Frame(camera.undistort(raw), camera.K, stamp, frame_of(message.header),
+                return Frame(camera.corrected(raw), camera.K, stamp, frame_of(message.header),
                              masks.of(stamp, raw.shape, camera))
         raise DjetError(f'the recording has no image with stamp {stamp} ns, which is in the '
                         'results; give the recording that was replayed')

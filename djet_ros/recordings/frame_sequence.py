@@ -78,7 +78,7 @@ class FrameSequence:
 
     def image(self, index: int) -> NDArray[np.uint8]:
         """Return the undistorted gray pixels (H, W) of a frame."""
-        return self._camera.undistort(self._images.gray(index))
+        return self._camera.corrected(self._images.gray(index))
 
     def frame(self, index: int) -> Frame:
         """Return a frame for the odometry; pixels that the file does not show are excluded."""
