@@ -118,6 +118,16 @@ class Standstill:
         """Return whether the camera stood still before, or may have, as most do at first."""
         return self._stood is not False
 
+    @property
+    def stood(self) -> bool:
+        """Return whether the camera stood still before, as some features of the reference did."""
+        return bool(self._stood and len(self._static))
+
+    def is_of_others(self, relative: RelativePose) -> bool:
+        """Return whether a pair has the motion of something else than the features that stood."""
+        static = np.isin(identifiers(relative.x[relative.inliers]), self._static)
+        return self.stood and bool(static.sum() < _LEAST_STILL)
+
     def _static_features_move(self, matches: Displaced, at_rest: bool | None) -> bool:
         """
         Return whether static features move in more of the image than they stand still in.
@@ -128,8 +138,8 @@ class Standstill:
         """
         static = self._static_among(matches, at_rest)
         still, slightly = static.still, static.slightly
-        if slightly.sum() >= max(_LEAST_STILL, _SLIGHTLY_OF_ALL * len(static.x),
-                                 MAX_SLIGHTLY * still.sum()):
+        if (slightly.sum() >= max(_LEAST_STILL, _SLIGHTLY_OF_ALL * len(static.x))
+                and _start_slowly(static)):
             return True
         moving = static.among(~still & ~slightly)
         together = moving.together()
@@ -158,8 +168,7 @@ class Standstill:
         matches = Displaced.of(relative, threshold).among(self._is_apart(relative.x))
         if self._stood is None:
             world = _world(matches, at_rest, horizon)
-            return bool(world.still.sum() >= _LEAST_STILL
-                        and world.slightly.sum() < MAX_SLIGHTLY * world.still.sum())
+            return world.still.sum() >= _LEAST_STILL and not _start_slowly(world)
         return self._stood and not self._static_features_move(matches, at_rest)
 
     def creeps(self, relative: RelativePose, threshold: float) -> bool:
@@ -186,9 +195,9 @@ class Standstill:
             return False
         spread = len(cells(matches.x[still])) / len(cells(matches.x))
         least = _STILL_AS_BEFORE if at_rest and self._stood is not False else _STILL
-        slightly = 1.0 if at_rest else MAX_SLIGHTLY
         return bool(still.mean() > least and spread > least
-                    and matches.slightly.sum() < slightly * still.sum())
+                    and (matches.slightly.sum() < still.sum() if at_rest
+                         else not _start_slowly(matches)))
 
     def _static_features_are_still(self, matches: Displaced, at_rest: bool | None) -> bool:
         """
@@ -202,6 +211,17 @@ class Standstill:
         standing = static.still.sum()
         return bool(standing >= _LEAST_STILL and standing > static.slightly.sum()
                     and standing > (static.inliers & ~static.still).sum())
+
+
+def _start_slowly(matches: Displaced) -> bool:
+    """
+    Return whether so many matches move slightly, as a camera that starts makes them.
+
+    Noise does, too, but has no common drift.
+    """
+    near = matches.among(matches.near)
+    return bool(matches.slightly.sum() >= MAX_SLIGHTLY * matches.still.sum()
+                and drifted(near.x, near.x + near.shift, _CREEP * near.threshold))
 
 
 def _in_place(relative: RelativePose, still: NDArray[np.bool_]) -> RelativePose:

@@ -183,10 +183,11 @@ class VisualOdometry:
             return self._stationary(frame, pair, span)
         # Verify the pair by the landmarks' depths and the gyro, and fuse the gyro's rotation.
         pair = self._verified(view, pair, priors, span)
-        if self._is_doubtful(pair, standing or pair, span):
+        may_stand = self._may_stand(standing or pair, span)
+        if may_stand and pair.status is Status.OK and not self._has_turned(pair, at_rest):
             pair = ambiguous(pair)
         if pair.status not in TRACKED:
-            return self._lost(frame, view, pair, span)
+            return self._lost(frame, view, pair, span, may_stand and self._standstill.stood)
         # Estimate the length of its translation, and integrate it.
         self._waited = not returned and self._waits_for_parallax(pair, span)
         return self._tracked(frame, view, pair, span)
@@ -245,20 +246,27 @@ class VisualOdometry:
         # What bridges bad pairs may be the motion of what made them bad: it calibrates no gyro.
         return self._priors.fuse(pair, priors.rotation, span, learn=not self._bad_pairs)
 
-    def _is_doubtful(self, pair: RelativePose, standing: RelativePose, span: Span) -> bool:
+    def _may_stand(self, standing: RelativePose, span: Span) -> bool:
         """
-        Return whether something that fills the image may move past a camera that stands still.
+        Return whether the camera may stand still while something that fills the image moves past.
+
+        standing: the pair as of a camera that stands, with all matches that stay in place.
+        """
+        return (span[1] - self._priors.known_ns < _UNMEASURED_START_NS
+                and self._standstill.is_likely(standing, self._config.standstill,
+                                               self._priors.at_rest(span), self._horizon))
+
+    def _has_turned(self, pair: RelativePose, at_rest: bool | None) -> bool:
+        """
+        Return whether the camera has turned, and so moved.
 
         Most cameras turn a little as they start; one on a rail may not, and is trusted after a
-        while. standing: the pair as of a camera that stands, with all matches that stay in place.
+        while.
         """
-        at_rest = self._priors.at_rest(span)
-        turned = (turns(pair, self._reference.view.K, self._config.standstill)
-                  if at_rest is None else not at_rest)
-        return (not turned and pair.status is Status.OK
-                and span[1] - self._priors.known_ns < _UNMEASURED_START_NS
-                and self._standstill.is_likely(standing, self._config.standstill, at_rest,
-                                               self._horizon))
+        if at_rest is not None:
+            return not at_rest
+        return (turns(pair, self._reference.view.K, self._config.standstill)
+                and not self._standstill.is_of_others(pair))
 
     def _started(self, frame: Frame, view: View, status: Status,
                  backwards: bool) -> OdometryResult:
@@ -301,14 +309,20 @@ class VisualOdometry:
         self._priors.forget_before(self._reference.since_ns)
         return result
 
-    def _lost(self, frame: Frame, view: View, pair: RelativePose, span: Span) -> OdometryResult:
-        """Hold the pose, and give up the reference after too many bad pairs."""
-        waits = self._waits_for_decision(pair, span)
+    def _lost(self, frame: Frame, view: View, pair: RelativePose, span: Span,
+              may_stand: bool) -> OdometryResult:
+        """
+        Hold the pose, and give up the reference after too many bad pairs.
+
+        may_stand: whether something that moves may hide what would stand still.
+        """
+        waits = may_stand or self._waits_for_decision(pair, span)
         self._bad_pairs += not waits
         given_up = not waits and self._bad_pairs >= self._config.max_lost
         length = self._scale.expected_length(span)
+        unknown = np.eye(4), UNKNOWN_MOTION
         motion, covariance = (self._priors.dead_reckoned(span)
-                              or _rotation_at_most(pair, length))
+                              or (unknown if may_stand else _rotation_at_most(pair, length)))
         trajectory = self._trajectory.moved(motion, covariance)
         result = self._result(frame, pair, length, motion, covariance, trajectory)
         if given_up or (pair.status in UNDECIDED and not waits):
