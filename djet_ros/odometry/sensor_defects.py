@@ -24,13 +24,14 @@ _LEAST_OFF, _LEAST_SHARE = 30, 1e-4
 
 _NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 
-# chosen: bands in which the steps from a column to the next are compared, and columns over which
-# their sum is kept. What is smoother neither is a corner, nor changes a descriptor.
-_BANDS, _WIDTH = 32, 15
+# chosen: bands in which the steps from a column to the next are compared, few to tell whether any
+# has an offset; and columns over which their sum is kept: what is smoother neither is a corner nor
+# changes a descriptor.
+_BANDS, _FEW_BANDS, _WIDTH = 32, 16, 15
 
 # chosen: excess of equal over unequal signs of a column's bend in both halves of an image, from
 # which columns have offsets. Tall things are in few of the columns: at most 0.1 in real images,
-# 0.25 in rendered streets, and 0.55 with offsets of one gray level (standard deviation).
+# 0.2 in rendered streets, and 0.5 or more with offsets of one gray level (standard deviation).
 _AGREEMENT = 0.4
 
 # Gray levels: robust standard deviation of the steps below which an image is left as it is. A
@@ -75,26 +76,32 @@ def offsets(gray: Gray, axis: int) -> Array | None:
     Return the offsets in gray levels of columns (axis 0) or rows (axis 1); None if there are none.
 
     Offsets of columns make the same steps at all heights, and what is in the scene does not: the
-    median of a column's steps over bands of the image tells them. So does each half of the bands.
-    Of these, bends (differences of steps) tell whether there are offsets, as a wall may brighten
-    from column to column; and if both halves correlate by r, 2 r / (1 + r) is the reliability of
-    the whole (Spearman and Brown, of tests), by which it is shrunk.
+    median of a column's steps over bands of the image tells them. So does each half of the bands:
+    if both correlate by r, 2 r / (1 + r) is the reliability of the whole (Spearman and Brown, of
+    tests), by which it is shrunk.
     """
-    if gray.shape[axis] < _BANDS:
+    if gray.shape[axis] < _BANDS or not _has_offsets(gray, axis):
         return None
-    steps = np.diff(_bands(gray, axis), axis=1)
-    halves = np.split(steps, 2)
-    one, other = (np.sign(np.diff(half, axis=1)).sum(0) for half in halves)
-    if np.sign(one * other).mean() < _AGREEMENT:
-        return None
-    whole, *of_halves = (medians(bands.T) for bands in (steps, *halves))
+    steps = np.diff(_bands(gray, axis, _BANDS), axis=1)
+    whole, *halves = (medians(bands.T) for bands in (steps, *np.split(steps, 2)))
     spread = robust_scale(whole)
     if spread < _LEAST_STEPS:
         return None
-    edges = np.max(np.abs(of_halves), axis=0) > _EDGE * spread
-    found, upper, lower = (_summed(np.where(edges, 0, each)) for each in (whole, *of_halves))
+    edges = np.max(np.abs(halves), axis=0) > _EDGE * spread
+    found, upper, lower = (_summed(np.where(edges, 0, each)) for each in (whole, *halves))
     r = max(float(np.corrcoef(upper, lower)[0, 1]), 0.0)
     return np.asarray(found * 2 * r / (1 + r))
+
+
+def _has_offsets(gray: Gray, axis: int) -> bool:
+    """
+    Return whether both halves of an image (H, W) bend in the same columns (axis 0) or rows (1).
+
+    Bends, or differences of steps, since a wall may brighten from column to column.
+    """
+    bends = np.sign(np.diff(_bands(gray, axis, _FEW_BANDS), n=2, axis=1))
+    upper, lower = (half.sum(0) for half in np.split(bends, 2))
+    return bool(np.sign(upper * lower).mean() > _AGREEMENT)
 
 
 def _summed(steps: Array) -> Array:
@@ -103,9 +110,9 @@ def _summed(steps: Array) -> Array:
     return np.asarray(total - uniform_filter1d(total, _WIDTH))
 
 
-def _bands(gray: Gray, axis: int) -> Array:
-    """Return the mean gray levels (_BANDS, W or H) of an image (H, W) in bands across an axis."""
-    edges = np.linspace(0, gray.shape[axis], _BANDS + 1).astype(int)
+def _bands(gray: Gray, axis: int, count: int) -> Array:
+    """Return the mean gray levels (count, W or H) of an image (H, W) in bands across an axis."""
+    edges = np.linspace(0, gray.shape[axis], count + 1).astype(int)
     bands = (gray[low:high] if axis == 0 else gray[:, low:high]
              for low, high in pairwise(edges))
     return np.stack([cv2.reduce(band, axis, cv2.REDUCE_AVG, dtype=cv2.CV_32F).ravel()
