@@ -308,7 +308,7 @@ def _scaled_depths(R: Array, t: Array, rays_x: Array, rays_y: Array) -> tuple[Ar
 
 def rotation_angle(Ra: Array, Rb: Array) -> float:
     """Angle in radians between two rotations (paper, "Evaluation metrics": Rodrigues)."""
-    return float(Rotation.from_matrix(Ra.T @ Rb).magnitude())
+    return float(norms(rotation_log(Ra.T @ Rb)))
 
 
 def direction_angle(ta: Array, tb: Array) -> float:
