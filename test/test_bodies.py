@@ -237,7 +237,7 @@ def test_while_a_lorry_is_overtaken_the_camera_keeps_its_own_motion(seed, first,
     Of the others that are left then, a third is false.
     """
     scene, estimator = make_scene('motorway', seed), TwoViewEstimator()
-    poses, before, prior = scene.trajectory(last + 1), None, None
+    poses, before, prior, shares = scene.trajectory(last + 1), None, None, []
     for index in range(first, last + 1):
         view = estimator.view(scene.render(poses[index], index), scene.K)
         if before is not None:
@@ -246,6 +246,7 @@ def test_while_a_lorry_is_overtaken_the_camera_keeps_its_own_motion(seed, first,
             assert prior.status is Status.OK
             assert np.degrees(rotation_angle(prior.R, truth[:3, :3])) < 0.02
             assert np.degrees(direction_angle(prior.t, truth[:3, 3])) < 0.4
+            shares.append(prior.inliers.mean())
         before = view
     # Matches on the lorry are kept, as outliers.
-    assert prior is not None and prior.inliers.sum() < 0.4 * len(prior.x)
+    assert min(shares) < 0.4

@@ -241,3 +241,20 @@ def test_few_corners_fit_into_a_small_image_and_less_of_it_is_rim_than_orb_leave
 @pytest.mark.parametrize('size', [(1, 1), (17, 900), (26, 26)])
 def test_images_smaller_than_a_descriptor_have_nothing_to_match(size):
     assert {outcome.status for outcome in same(noise(1, size))} == {Status.TOO_FEW_MATCHES}
+
+
+@pytest.mark.parametrize('seed', [20, 21])
+def test_over_a_plane_an_exposure_that_changes_leads_to_no_wrong_motion(seed):
+    """Two motions fit the plane, and what decides between them must be no error of the matches."""
+    scene, odometry = make_scene('flight', seed), VisualOdometry()
+    poses, rng, decided = scene.trajectory(40), np.random.default_rng(1), 0
+    for i in range(20, 40):
+        exposed = scene.render(poses[i], i) * rng.uniform(0.6, 1.5) + rng.uniform(-20, 20)
+        image = np.clip(np.rint(exposed), 0, 255).astype(np.uint8)
+        result = odometry.process(Frame(image, scene.K, i * PERIOD_NS))
+        if result.status is Status.OK and result.previous_stamp_ns is not None:
+            before = poses[result.previous_stamp_ns // PERIOD_NS]
+            found = compared(result.relative, np.linalg.inv(poses[i]) @ before)
+            assert found.rotation < 0.3 and found.direction < 6
+            decided += 1
+    assert decided > 10

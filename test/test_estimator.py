@@ -598,7 +598,7 @@ def test_two_poses_of_equal_cost_are_ambiguous(corridor: Path):
 @pytest.mark.slow
 @pytest.mark.parametrize('preset_name', ['best', 'fast', 'paper'])
 def test_on_real_frames_descriptors_do_better_than_points(kitti: Path, preset_name):
-    sequence = KittiSequence(kitti / 'sequences/06', start=20, end=29)
+    sequence = KittiSequence(kitti / 'sequences/06', start=20)
     frames = [sequence.image(i) for i in range(len(sequence))]
     steps = [np.linalg.inv(b) @ a for a, b in pairwise(sequence.poses)]
     motions = [(step[:3, :3], step[:3, 3]) for step in steps]
@@ -609,7 +609,7 @@ def test_on_real_frames_descriptors_do_better_than_points(kitti: Path, preset_na
     # With sub-pixel corners both are within the accuracy of the true directions here.
     assert descriptors[1] < points[1] or max(descriptors[1], points[1]) < 0.35
     assert (points < errors['five_point'].mean(0)).all()
-    assert errors['djet'][:, 0].max() < 0.1
+    assert errors['djet'][:, 0].max() < (0.12 if preset_name == 'paper' else 0.06)
 
 
 # Input other than images of a scene.

@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.flow import NEAR_LEVELS, track_features
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.hamming import match_distances
 from djet_ros.core.matching import match_predicted, match_widely
@@ -112,3 +113,23 @@ def test_the_required_number_of_matches_scales_with_the_features(more: int) -> N
     # With a third as many features in the previous pair, three times as many are expected.
     assert match_predicted(previous, current, replace(before, sought=count // 3), KnownMotion(),
                            0.15) is None
+
+
+@pytest.mark.parametrize(('gain', 'offset'), [(1.1, 0), (0.8, 0), (1.5, -20), (1.0, 12)])
+def test_corners_are_tracked_if_the_exposure_changes(gain, offset):
+    """From their old gray levels optical flow would lose most of them."""
+    image = textured(np.random.default_rng(91), SIZE)
+    shift = np.array([2.4, -1.3])
+    moved = cv2.warpAffine(image, np.column_stack([np.eye(2), shift]), SIZE,
+                           flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    estimator = TwoViewEstimator(EstimatorConfig(max_features=600))
+    # So that nothing is saturated.
+    previous, current = (estimator.view(np.clip(np.rint((60 + each / 4) * factor + more), 0, 255)
+                                        .astype(np.uint8), K)
+                         for each, factor, more in ((image, 1, 0), (moved, gain, offset)))
+    points = previous.features.points
+    y, bits = track_features(previous, current, points, 32.0, NEAR_LEVELS)
+    found, inside = np.isfinite(bits), ((points > 40) & (points < np.array(SIZE) - 40)).all(1)
+    assert found[inside].mean() > 0.95
+    errors = np.linalg.norm(y - points - shift, axis=1)[found & inside]
+    assert np.median(errors) < 0.1 and np.quantile(errors, 0.95) < 0.3

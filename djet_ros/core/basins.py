@@ -95,8 +95,8 @@ class BasinTuning:
     parts: tuple[int, int] = (4, 2)
     # chosen: steps from the motion of a part
     steps_of_part: int = 10
-    # preference of the first basin over all others for a decision before they have converged: an
-    # error of one in three million, if errors in different cells are independent
+    # preference of the first basin over all others for a decision on few of the starts: an error
+    # of one in three million, if errors in different cells are independent
     clear_preference: float = 5.0
 
 
@@ -171,9 +171,10 @@ def choose_predicted_basin(problem: JetProblem, places: Array, predicted: Previo
     Choose among the basins around the predicted motion: its own, and a hemisphere of directions.
 
     predicted: t is zeros if its direction is unknown. A subset of the matches finds the basins,
-    and all matches choose. If they do not clearly prefer one, the basins are refined to
-    convergence, as some may lead to the same minimum; if that does not help, they are refined on
-    all matches. If a rotation alone explains the matches, the choice does not matter.
+    and all matches choose. If they do not clearly prefer one, also after the others have
+    converged, basins are sought from all starts again, as some may lead to the same minimum; if
+    that does not help, they are refined on all matches. If a rotation alone explains the matches,
+    the choice does not matter.
     """
     subset = problem.subset(subsampled(len(problem.blur), BASIN_TUNING.matches_predicted))
     tight = Loss()
@@ -183,9 +184,14 @@ def choose_predicted_basin(problem: JetProblem, places: Array, predicted: Previo
         tight = _tight_loss(config, _noise(refined))
         if steps:
             basins = _cheapest_basins(subset, refined, tight, BASIN_TUNING.refined_starts)
-    if ((len(basins) > 1 and _is_clear(problem, places, basins, tight))
-            or _is_pure_rotation(problem, config.min_parallax)):
+    if _is_pure_rotation(problem, config.min_parallax):
         return basin_of(problem, basins[0])
+    if len(basins) > 1 and _is_clear(problem, places, basins, tight):
+        # Before the others have converged, they cost more than they should.
+        refined = refine_all(subset, basins, tight, BASIN_TUNING.steps_to_compare)
+        basins = _cheapest_basins(subset, refined, tight, BASIN_TUNING.refined_starts)
+        if _is_clear(problem, places, basins, tight):
+            return basin_of(problem, basins[0])
     # Include all starts again: the cheapest so far may all be of one valley.
     refined = refine_all(subset, [*basins, *starts], tight, BASIN_TUNING.steps_to_compare)
     basins = _cheapest_basins(subset, refined, tight, BASIN_TUNING.refined_starts)

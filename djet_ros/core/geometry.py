@@ -62,6 +62,7 @@ def unit(v: Array) -> Array:
 
 def norms(v: NDArray[Any]) -> NDArray[Any]:
     """Lengths (…) of short vectors along the last axis, by component: a third of the time."""
+    v = np.asarray(v)
     total = v[..., 0]**2
     for k in range(1, v.shape[-1]):
         total += v[..., k]**2

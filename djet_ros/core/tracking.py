@@ -143,7 +143,7 @@ def _limited_by_chirality(algorithm: Algorithm, track: Track) -> Track:
     first, agree = algorithm.first, track.inliers()
     if (not first.rivals or all(rival.preference < SIGNIFICANT_PREFERENCE
                                 for rival in track.rivals)
-            or not is_planar(algorithm.pair.x[agree], track.placed.places[agree], track.scale)):
+            or not is_planar(algorithm.pair.x[agree], track.minima[agree], track.scale)):
         return track
     basin = first.nearest(track.pose)
     preferred = preferences(first.chirality_losses(), first.x, basin)
@@ -189,7 +189,7 @@ def _with_planar_twin(track: Track, pair: Pair) -> Track:
     """
     agree = track.inliers()
     twin = planar_twin(track.pose, pair.current.K, pair.x[agree],
-                       track.placed.places[agree], track.scale) if agree.any() else None
+                       track.minima[agree], track.scale) if agree.any() else None
     if twin is None:
         return track
     near = unsigned_distance(track.pose, twin.pose) / 2

@@ -168,7 +168,7 @@ class Standstill:
         matches = Displaced.of(relative, threshold).among(self._is_apart(relative.x))
         if self._stood is None:
             world = _world(matches, at_rest, horizon)
-            return world.still.sum() >= _LEAST_STILL and not _start_slowly(world)
+            return bool(world.still.sum() >= _LEAST_STILL) and not _start_slowly(world)
         return self._stood and not self._static_features_move(matches, at_rest)
 
     def creeps(self, relative: RelativePose, threshold: float) -> bool:
