@@ -22,7 +22,7 @@ def test_a_sequence_gives_images_camera_stamps_and_poses(small_kitti):
         0, 103622300, 207244600, 310866900, 414489200, 518111500]
     assert sequence.poses[3][:3, 3].tolist() == [0, 0, 1.5]
     expected = cv2.imread(str(folder / 'image_0' / '000004.png'), cv2.IMREAD_GRAYSCALE)
-    assert (sequence.image(4) == expected).all()
+    assert (sequence.raw(4) == expected).all()
 
 
 def test_real_frames_are_read(kitti):
