@@ -82,14 +82,11 @@ def _is_exposed_otherwise(before: NDArray[np.uint8], after: NDArray[np.uint8], p
 
     For the median they need not be exactly there.
     """
-    if not len(points):
-        return False
     height, width = after.shape
-    columns, rows = np.rint(start).astype(np.int64).T
-    x = np.rint(points).astype(np.int64)
-    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    now = after[rows[inside], columns[inside]].astype(np.float64)
-    change = now - before[x[inside, 1], x[inside, 0]]
+    inside = ((start > -0.5) & (start < (width - 0.5, height - 0.5))).all(1)
+    (columns, rows), (columns_before, rows_before) = (
+        np.rint(places[inside]).astype(np.int64).T for places in (start, points))
+    change = after[rows, columns].astype(np.float64) - before[rows_before, columns_before]
     return bool(len(change) and abs(median(change)) > _OTHER_EXPOSURE)
 
 

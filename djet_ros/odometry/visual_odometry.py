@@ -65,7 +65,8 @@ class VisualOdometry:
       pairs in a row each frame becomes the reference until a pair is good; the missing motion is
       in the pose's covariance. A pair with two possible motions (UNDECIDED) does not keep it, as
       its images are good.
-    * A standstill keeps it, so that noise does not accumulate.
+    * A standstill keeps it, so that noise does not accumulate; so do pairs in which something that
+      moves may hide what stood still.
     * While most of its image is in view, slow motion keeps it and accumulates: without parallax,
       if new landmarks are needed, until its direction can be estimated; with two motions that the
       pair before may tell apart, until it does.
