@@ -611,6 +611,7 @@ def test_on_real_frames_descriptors_do_better_than_points(kitti: Path, preset_na
     # With sub-pixel corners both are within the accuracy of the true directions here.
     assert descriptors[1] < points[1] or max(descriptors[1], points[1]) < 0.35
     assert (points < errors['five_point'].mean(0)).all()
+    assert errors['djet'][:9, 0].max() < 0.1
     assert errors['djet'][:, 0].max() < (0.12 if preset_name == 'paper' else 0.06)
 
 

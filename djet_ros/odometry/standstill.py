@@ -125,8 +125,12 @@ class Standstill:
 
     def is_of_others(self, relative: RelativePose) -> bool:
         """Return whether a pair has the motion of something else than the features that stood."""
-        static = np.isin(identifiers(relative.x[relative.inliers]), self._static)
+        static = self._is_static(relative.x[relative.inliers])
         return self.stood and bool(static.sum() < _LEAST_STILL)
+
+    def _is_static(self, x: Array) -> NDArray[np.bool_]:
+        """Return which pixels (N, 2) of the reference view are of features that stood."""
+        return np.isin(identifiers(x), self._static)
 
     def _static_features_move(self, matches: Displaced, at_rest: bool | None) -> bool:
         """
@@ -152,7 +156,7 @@ class Standstill:
 
         A car that waits in traffic vibrates, unless a gyro is at rest.
         """
-        static = matches.among(np.isin(identifiers(matches.x), self._static))
+        static = matches.among(self._is_static(matches.x))
         vibrates = not at_rest and matches.near.sum() < len(matches.x) / 2
         return static.without_drift() if vibrates else static
 
@@ -165,11 +169,13 @@ class Standstill:
         unknown, enough matches have to be still, and few others may move slightly. at_rest,
         horizon: as for ``detect``.
         """
+        if self._stood is False:
+            return False
         matches = Displaced.of(relative, threshold).among(self._is_apart(relative.x))
         if self._stood is None:
             world = _world(matches, at_rest, horizon)
             return bool(world.still.sum() >= _LEAST_STILL) and not _start_slowly(world)
-        return self._stood and not self._static_features_move(matches, at_rest)
+        return not self._static_features_move(matches, at_rest)
 
     def creeps(self, relative: RelativePose, threshold: float) -> bool:
         """

@@ -184,7 +184,7 @@ class VisualOdometry:
             return self._stationary(frame, pair, span)
         # Verify the pair by the landmarks' depths and the gyro, and fuse the gyro's rotation.
         pair = self._verified(view, pair, priors, span)
-        may_stand = self._may_stand(standing or pair, span)
+        may_stand = self._may_stand(standing or pair, span, at_rest)
         if may_stand and pair.status is Status.OK and not self._has_turned(pair, at_rest):
             pair = ambiguous(pair)
         if pair.status not in TRACKED:
@@ -247,15 +247,15 @@ class VisualOdometry:
         # What bridges bad pairs may be the motion of what made them bad: it calibrates no gyro.
         return self._priors.fuse(pair, priors.rotation, span, learn=not self._bad_pairs)
 
-    def _may_stand(self, standing: RelativePose, span: Span) -> bool:
+    def _may_stand(self, standing: RelativePose, span: Span, at_rest: bool | None) -> bool:
         """
         Return whether the camera may stand still while something that fills the image moves past.
 
         standing: the pair as of a camera that stands, with all matches that stay in place.
         """
         return (span[1] - self._priors.known_ns < _UNMEASURED_START_NS
-                and self._standstill.is_likely(standing, self._config.standstill,
-                                               self._priors.at_rest(span), self._horizon))
+                and self._standstill.is_likely(standing, self._config.standstill, at_rest,
+                                               self._horizon))
 
     def _has_turned(self, pair: RelativePose, at_rest: bool | None) -> bool:
         """
@@ -277,9 +277,8 @@ class VisualOdometry:
             self._clear()
             self._last = frame
         elif status is not Status.FIRST_FRAME:
-            unknown = np.eye(4), UNKNOWN_MOTION
             self._trajectory = self._trajectory.moved(*(self._priors.dead_reckoned(
-                (self._reference.since_ns, frame.stamp_ns)) or unknown))
+                (self._reference.since_ns, frame.stamp_ns)) or _unknown_motion()))
         if backwards or status is Status.FIRST_FRAME:
             self._priors.known_ns = frame.stamp_ns
         self._refer_to(frame, view, None)
@@ -321,9 +320,8 @@ class VisualOdometry:
         self._bad_pairs += not waits
         given_up = not waits and self._bad_pairs >= self._config.max_lost
         length = self._scale.expected_length(span)
-        unknown = np.eye(4), UNKNOWN_MOTION
-        motion, covariance = (self._priors.dead_reckoned(span)
-                              or (unknown if may_stand else _rotation_at_most(pair, length)))
+        motion, covariance = self._priors.dead_reckoned(span) or (
+            _unknown_motion() if may_stand else _rotation_at_most(pair, length))
         trajectory = self._trajectory.moved(motion, covariance)
         result = self._result(frame, pair, length, motion, covariance, trajectory)
         if given_up or (pair.status in UNDECIDED and not waits):
@@ -434,6 +432,11 @@ def _rotation_at_most(pair: RelativePose, length: Length) -> tuple[Array, Array]
     For an AMBIGUOUS pair: its rotation, with a covariance that spans its hypotheses.
     """
     if pair.status is not Status.AMBIGUOUS:
-        return np.eye(4), UNKNOWN_MOTION
+        return _unknown_motion()
     rotation = replace(pair, t=np.zeros(3))
     return camera_motion(rotation), motion_covariance(rotation, length)
+
+
+def _unknown_motion() -> tuple[Array, Array]:
+    """Return no motion (4, 4), with the covariance (6, 6) of any."""
+    return np.eye(4), UNKNOWN_MOTION
