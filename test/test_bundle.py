@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import cv2
 from djet_ros.core.bundle import (
     eliminate,
     jacobians,
@@ -14,25 +13,25 @@ from djet_ros.core.bundle import (
     Poses,
     projected,
 )
-from djet_ros.core.geometry import rotation_exp
-from djet_ros.core.radial import distort, undistort
+from djet_ros.core.correction import Correction
+from djet_ros.core.geometry import rays, rotation_exp
+from djet_ros.core.radial import distort
 import numpy as np
 import pytest
 
 K = np.array([[500.0, 9, 320], [0, 480, 240], [0, 0, 1]])
 
 
-def scene(rng, frames=4, landmarks=40, k1=0.05):
-    """Poses of a camera that drives and turns, and exact observations of landmarks through k1."""
+def scene(rng, frames=4, landmarks=40):
+    """Poses of a camera that drives and turns, and exact observations of landmarks."""
     poses = Poses(
         np.array([rotation_exp(np.array([0.01, 0.03, -0.02]) * f) for f in range(frames)]),
-        np.array([[0.1, -0.05, -0.4]]) * np.arange(frames)[:, None], k1)
+        np.array([[0.1, -0.05, -0.4]]) * np.arange(frames)[:, None])
     found = Landmarks.at(rng.uniform((100, 80), (540, 400), (landmarks, 2)),
                          1 / rng.uniform(4, 20, landmarks), 0, frames)
     found.anchors[landmarks // 2:] = 1
-    found.points = undistort(K, found.anchor_pixels, k1)
     for frame in range(frames):
-        found.minima[:, frame] = projected(K, points_in_frame(K, poses, found, frame), k1)
+        found.minima[:, frame] = projected(K, points_in_frame(K, poses, found, frame))
         later = found.anchors < frame
         found.observed[later, frame] = True
         A = rng.normal(size=(landmarks, 2, 2))
@@ -41,18 +40,20 @@ def scene(rng, frames=4, landmarks=40, k1=0.05):
     return poses, found
 
 
+def with_camera(step):
+    """Return a step of camera and poses in which the camera stays."""
+    return np.concatenate([np.zeros(4), step])
+
+
 def test_a_landmark_is_observed_at_its_projection():
     poses, landmarks = scene(np.random.default_rng(0))
     for n in (0, 39):
         anchor = landmarks.anchors[n]
         ray = np.linalg.inv(K) @ [*landmarks.points[n], 1]
         world = poses.R[anchor].T @ (ray / landmarks.rho[n] - poses.t[anchor])
-        here = poses.R[3] @ world + poses.t[3]
-        # OpenCV knows no skew.
-        there = cv2.projectPoints(here, np.zeros(3), np.zeros(3), np.eye(3),
-                                  np.array([0.05, 0, 0, 0]))[0]
-        assert projected(K, points_in_frame(K, poses, landmarks, 3), 0.05)[n] == pytest.approx(
-            (K @ [*there.ravel(), 1])[:2])
+        there = K @ (poses.R[3] @ world + poses.t[3])
+        assert projected(K, points_in_frame(K, poses, landmarks, 3))[n] == pytest.approx(
+            there[:2] / there[2])
 
 
 def test_a_camera_takes_points_into_the_world():
@@ -66,7 +67,7 @@ def test_a_camera_takes_points_into_the_world():
 
 def test_points_far_outside_the_image_are_not_folded_into_it():
     far = np.array([[20.0, 0, 1], [0, -1e5, 1], [3, 3, -1], [1e12, 0, 0]])
-    pixels = np.abs(projected(K, far, -0.05))
+    pixels = np.abs(projected(K, far))
     assert (pixels > 2000).any(1).all()
     # They are rounded to integers.
     assert pixels.max() < 2**31
@@ -80,14 +81,14 @@ def test_exact_observations_leave_no_residual():
 
 
 def test_a_landmark_in_the_plane_of_the_camera_leaves_the_equations_finite():
-    poses = Poses(np.array([np.eye(3)] * 2), np.array([[0, 0, 0], [0, 0, -0.5]]), 0.05)
+    poses = Poses(np.array([np.eye(3)] * 2), np.array([[0, 0, 0], [0, 0, -0.5]]))
     landmarks = Landmarks.at(np.array([[340.0, 250]]), np.array([2.0]), 0, 2)
     landmarks.observed[:, 1], landmarks.roots[:, 1] = True, np.eye(2)
     observed = observe(K, poses, landmarks)
     assert observed.place[0, 2] == 0
-    reduced = eliminate(observed, np.ones(1), 1.0, 2, lens=True)
+    reduced = eliminate(observed, np.ones(1), 1.0, 2)
     assert np.isfinite(reduced.H).all() and np.isfinite(reduced.g).all()
-    assert np.isfinite(reduced.change(np.zeros(12))).all()
+    assert np.isfinite(reduced.change(np.zeros(16))).all()
 
 
 def test_jacobians_are_those_of_finite_differences():
@@ -97,16 +98,30 @@ def test_jacobians_are_those_of_finite_differences():
     by = jacobians(observed)
     step = np.random.default_rng(3).normal(size=(4, 6)) * 1e-6
     own = np.random.default_rng(4).normal(size=(40, 3)) * [1e-7, 1e-5, 1e-5]
-    bent = 1e-7
     expected = (np.einsum('nij,nj->ni', by.by_frame, step[observed.frame])
                 + np.einsum('nij,nj->ni', by.by_anchor, step[observed.anchor])
-                + np.einsum('nij,nj->ni', by.by_own, own[observed.landmark]) + by.by_k1 * bent)
-    ahead, back = (observe(K, replace(poses.moved(sign * step.ravel()), k1=0.05 + sign * bent),
-                           landmarks.moved(sign * own)) for sign in (1, -1))
+                + np.einsum('nij,nj->ni', by.by_own, own[observed.landmark]))
+    ahead, back = (observe(K, poses.moved(sign * step.ravel()), landmarks.moved(sign * own))
+                   for sign in (1, -1))
     assert (ahead.residuals - back.residuals) / 2 == pytest.approx(expected, rel=1e-5, abs=1e-9)
     assert (ahead.anchor_residuals - back.anchor_residuals) / 2 == pytest.approx(
-        np.einsum('nij,nj->ni', by.points_by_own, own[:, 1:]) + by.points_by_k1 * bent, rel=1e-5,
-        abs=1e-9)
+        np.einsum('nij,nj->ni', by.points_by_own, own[:, 1:]), rel=1e-5, abs=1e-9)
+
+
+def test_jacobians_by_the_camera_are_those_of_one_that_deviates():
+    poses, landmarks = scene(np.random.default_rng(2))
+    observed = observe(K, poses, landmarks)
+    by, rng = jacobians(observed), np.random.default_rng(3)
+    for wrong in (*1e-6 * np.eye(4), 1e-6 * rng.normal(size=4)):
+        correction = Correction(*wrong)
+        there = correction.camera_matrix(K)
+        for places, root, found in (
+                (observed.place, observed.root, by.by_camera),
+                (rays(K, landmarks.points), observed.anchor_roots, by.points_by_camera)):
+            moved = (distort(there, projected(there, places), correction.k1)
+                     - projected(K, places))
+            assert found @ wrong == pytest.approx(np.einsum('nij,nj->ni', root, moved), rel=1e-4,
+                                                  abs=1e-8)
 
 
 def test_a_step_and_its_inverse_cancel():
@@ -117,13 +132,15 @@ def test_a_step_and_its_inverse_cancel():
 
 def test_elimination_equals_solving_the_full_system():
     poses, landmarks = scene(np.random.default_rng(7))
+    # Rotations about several axes determine the camera.
+    poses = poses.moved(np.random.default_rng(25).normal(size=24) * 0.15)
     landmarks.minima += np.random.default_rng(8).normal(size=landmarks.minima.shape)
     landmarks.points += np.random.default_rng(13).normal(size=landmarks.points.shape)
     observed = observe(K, poses, landmarks)
     by = jacobians(observed)
     weights = np.random.default_rng(9).uniform(0.5, 2, len(observed.residuals))
-    J, of_k1 = np.zeros((len(weights) + 40, 2, 24 + 3 * 40)), np.empty((len(weights) + 40, 2))
-    of_k1[:len(weights)], of_k1[len(weights):] = by.by_k1, by.points_by_k1
+    J = np.zeros((len(weights) + 40, 2, 24 + 3 * 40))
+    of_camera = np.concatenate([by.by_camera, by.points_by_camera])
     for n, (landmark, frame, anchor) in enumerate(
             zip(observed.landmark, observed.frame, observed.anchor)):
         J[n, :, 6 * frame:6 * frame + 6] += by.by_frame[n]
@@ -138,30 +155,26 @@ def test_elimination_equals_solving_the_full_system():
     held = np.diag([*[1.0] * 24, *[0.0] * 120])
     whole = -np.linalg.solve((J * W).T @ J + held, (J * W).T @ e)
     reduced = eliminate(observed, weights, 0.7, 4)
-    step = -np.linalg.solve(reduced.H + np.eye(24), reduced.g)
-    assert step == pytest.approx(whole[:24], rel=1e-4, abs=1e-7)
+    step = with_camera(-np.linalg.solve(reduced.H[4:, 4:] + np.eye(24), reduced.g[4:]))
+    assert step[4:] == pytest.approx(whole[:24], rel=1e-4, abs=1e-7)
     assert reduced.change(step).ravel() == pytest.approx(whole[24:], rel=1e-4, abs=1e-6)
-    # With k1, and no other information: the gauge does not affect it.
-    bent = eliminate(observed, weights, 0.7, 4, lens=True)
-    assert np.allclose(bent.H, reduced.H, rtol=1e-6)
-    assert bent.g == pytest.approx(reduced.g, rel=1e-6, abs=1e-6)
-    assert bent.change(step) == pytest.approx(reduced.change(step), rel=1e-6, abs=1e-9)
-    J = np.column_stack([of_k1.ravel(), J])
-    information = np.linalg.pinv((J * W).T @ J, rcond=1e-11, hermitian=True)
-    marginal = bent.marginal_k1()
-    assert marginal.curvature**-1 == pytest.approx(information[0, 0], rel=1e-3)
-    assert marginal.step == pytest.approx(-(information @ (J * W).T @ e)[0], rel=1e-3)
+    # With the camera, and no other information: the gauge does not affect it.
+    J = np.column_stack([of_camera.reshape(-1, 4), J])
+    information = np.linalg.pinv((J * W).T @ J, rcond=1e-12, hermitian=True)
+    H, g = reduced.of_camera()
+    assert np.linalg.inv(H) == pytest.approx(information[:4, :4], rel=1e-2)
+    assert -np.linalg.solve(H, g) == pytest.approx(-(information @ (J * W).T @ e)[:4], rel=1e-2)
 
 
 def test_without_observations_there_is_no_information_on_poses():
     poses, landmarks = scene(np.random.default_rng(23))
     landmarks.observed[:] = False
     reduced = eliminate(observe(K, poses, landmarks), np.empty(0), 1.0, 4)
-    assert not reduced.H.any() and not reduced.g.any()
+    assert not reduced.H[4:].any() and not reduced.g[4:].any()
     # The landmarks go back to where their patches were.
-    back = landmarks.moved(reduced.change(np.zeros(24)))
+    back = landmarks.moved(reduced.change(np.zeros(28)))
     assert back.rho == pytest.approx(landmarks.rho)
-    assert back.points == pytest.approx(undistort(K, landmarks.anchor_pixels, 0.05), abs=0.1)
+    assert back.points == pytest.approx(landmarks.anchor_pixels)
 
 
 def test_poses_and_depths_are_recovered_without_noise():
@@ -174,9 +187,9 @@ def test_poses_and_depths_are_recovered_without_noise():
     for _ in range(8):
         observed = observe(K, wrong, guessed)
         reduced = eliminate(observed, np.ones(len(observed.residuals)), 1.0, 4)
-        step = -np.linalg.solve(reduced.H + held, reduced.g)
+        step = -np.linalg.solve(reduced.H[4:, 4:] + held, reduced.g[4:])
         wrong = wrong.moved(step)
-        guessed = guessed.moved(reduced.change(step))
+        guessed = guessed.moved(reduced.change(with_camera(step)))
     assert np.abs(wrong.step_from(poses)).max() < 1e-6
     assert guessed.rho == pytest.approx(landmarks.rho, rel=1e-5)
 
@@ -194,7 +207,7 @@ def test_frames_that_come_and_go_leave_the_others_where_they_are():
     poses, landmarks = scene(np.random.default_rng(18))
     more, _ = scene(np.random.default_rng(18), frames=5)
     poses, landmarks = poses.joined(more.R[4], more.t[4]), landmarks.with_frame()
-    landmarks.minima[:, 4] = projected(K, points_in_frame(K, more, landmarks, 4), more.k1)
+    landmarks.minima[:, 4] = projected(K, points_in_frame(K, more, landmarks, 4))
     landmarks.roots[:, 4], landmarks.observed[:, 4] = np.eye(2), True
     for removed in (2, 0):
         poses, landmarks = poses.without_frame(removed), landmarks.without_frame(removed)
@@ -203,18 +216,20 @@ def test_frames_that_come_and_go_leave_the_others_where_they_are():
         assert np.abs(observed.residuals).max() < 1e-9
 
 
-def test_observations_say_the_same_in_images_corrected_for_another_k1():
-    rng, before, after = np.random.default_rng(19), 0.03, -0.08
+def test_observations_say_the_same_in_images_of_another_correction():
+    rng, before, after = np.random.default_rng(19), (K, 0.03), (
+        Correction(0, 0.01, 0.004, -0.006).camera_matrix(K), -0.08)
     _, landmarks = scene(rng)
     landmarks.slopes = rng.normal(size=(40, 2)) * 1e-3
     off = rng.normal(size=(40, 2)) * 1e-3
     beside = replace(landmarks, anchor_pixels=landmarks.anchor_pixels + off,
                      minima=landmarks.minima + off[:, None])
-    corrected, next_to = (one.with_corrected_images(K, before, after)
+    corrected, next_to = (one.with_corrected_images(before, after)
                           for one in (landmarks, beside))
     for pixels, moved in ((landmarks.anchor_pixels, corrected.anchor_pixels),
                           (landmarks.minima[:, 1], corrected.minima[:, 1])):
-        assert distort(K, moved, after) == pytest.approx(distort(K, pixels, before), abs=1e-3)
+        assert distort(after[0], moved, after[1]) == pytest.approx(
+            distort(K, pixels, before[1]), abs=1e-3)
     shift = next_to.anchor_pixels - corrected.anchor_pixels
     assert np.abs(shift - off).max() > 1e-4
     by_slopes = (np.einsum('ni,ni->n', one.slopes, way) for one, way in (
@@ -225,7 +240,7 @@ def test_observations_say_the_same_in_images_corrected_for_another_k1():
     shifts = next_to.minima - corrected.minima
     assert np.einsum('nfij,nfj->nfi', corrected.roots, shifts) == pytest.approx(
         np.einsum('nfij,nj->nfi', landmarks.roots, off), rel=1e-3, abs=1e-6)
-    assert corrected.points is landmarks.points
+    assert rays(after[0], corrected.points) == pytest.approx(rays(K, landmarks.points))
 
 
 def test_noise_of_the_anchor_patch_does_not_bias_steps():
@@ -241,8 +256,9 @@ def test_noise_of_the_anchor_patch_does_not_bias_steps():
     for _ in range(6):
         observed = observe(K, poses, landmarks)
         reduced = eliminate(observed, np.full(len(observed.residuals), 1e4), 1.0, 3)
-        step = -np.linalg.solve(reduced.H + held, reduced.g)
-        poses, landmarks = poses.moved(step), landmarks.moved(reduced.change(step))
+        step = -np.linalg.solve(reduced.H[4:, 4:] + held, reduced.g[4:])
+        poses = poses.moved(step)
+        landmarks = landmarks.moved(reduced.change(with_camera(step)))
     found = np.linalg.norm(poses.t[2] - poses.R[2] @ poses.R[1].T @ poses.t[1])
     assert found == pytest.approx(length, rel=3e-3)
 
@@ -258,7 +274,7 @@ def test_the_noise_estimate_accounts_for_degrees_of_freedom(frames):
     for _ in range(4):
         observed = observe(K, poses, landmarks)
         reduced = eliminate(observed, np.ones(len(observed.residuals)), 1.0, frames)
-        landmarks = landmarks.moved(reduced.change(np.zeros(6 * frames)))
+        landmarks = landmarks.moved(reduced.change(np.zeros(4 + 6 * frames)))
     found = noise_scale(observe(K, poses, landmarks))
     assert found == pytest.approx(0.3, rel=0.05)
     # Landmarks that were only just created tell nothing.
@@ -267,9 +283,10 @@ def test_the_noise_estimate_accounts_for_degrees_of_freedom(frames):
 
 
 def random_prior(rng, frames):
-    """Return a prior that determines all of its poses, far from those it is linearised at."""
-    half = rng.normal(size=(6 * frames, 6 * frames))
-    return PosePrior(half @ half.T + np.eye(6 * frames), 9 * rng.normal(size=6 * frames), Poses(
+    """Return a prior that determines camera and poses, far from those it is linearised at."""
+    size = 4 + 6 * frames
+    half = rng.normal(size=(size, size))
+    return PosePrior(half @ half.T + np.eye(size), 9 * rng.normal(size=size), Poses(
         rotation_exp(rng.normal(size=(frames, 3))), rng.normal(size=(frames, 3))))
 
 
@@ -282,7 +299,7 @@ def test_the_gradient_of_a_prior_is_that_of_its_cost():
     slopes = [(prior.at(poses.moved(step)).cost - prior.at(poses.moved(-step)).cost) / 2e-6
               for step in 1e-6 * np.eye(12)]
     found = prior.at(poses).gradient
-    assert np.abs(found - prior.g).max() > 50
+    assert np.abs(found - prior.g[4:]).max() > 50
     assert slopes == pytest.approx(found, rel=1e-3, abs=0.1)
 
 
@@ -295,13 +312,26 @@ def test_information_is_added_to_a_prior_where_it_was_linearised():
     costs = [prior.at(poses).cost for poses in (there, there.moved(step))]
     prior.add(added.H, added.g, there)
     more = [prior.at(poses).cost - cost for poses, cost in zip((there, there.moved(step)), costs)]
-    assert more[1] - more[0] == pytest.approx(step @ added.H @ step / 2 + added.g @ step)
+    assert more[1] - more[0] == pytest.approx(
+        step @ added.of_poses @ step / 2 + added.g[4:] @ step)
+
+
+def test_a_prior_says_the_same_relative_to_another_camera():
+    rng = np.random.default_rng(24)
+    prior, change = random_prior(rng, 2), rng.normal(size=4)
+    corrected = prior.with_corrected_camera(change)
+    # Where the poses go if the camera is known to be off by so much.
+    expected = -np.linalg.solve(prior.of_poses, prior.g[4:] + prior.H[4:, :4] @ change)
+    assert -np.linalg.solve(corrected.of_poses, corrected.g[4:]) == pytest.approx(expected)
+    # And the minimum over both: the camera is nearer by the change.
+    whole, relative = (-np.linalg.solve(one.H, one.g) for one in (prior, corrected))
+    assert relative == pytest.approx(whole - [*change, *[0.0] * 12])
 
 
 @pytest.mark.parametrize('frame', range(3))
 def test_without_a_frame_a_prior_keeps_minimum_and_covariance_of_the_others(frame):
     prior, kept = random_prior(np.random.default_rng(21), 3), np.arange(3) != frame
-    left, columns = prior.without_frame(frame), np.repeat(kept, 6)
+    left, columns = prior.without_frame(frame), np.repeat([True, *kept], [4, 6, 6, 6])
     covariance = np.linalg.inv(prior.H)
     assert np.linalg.inv(left.H) == pytest.approx(covariance[np.ix_(columns, columns)], rel=1e-3,
                                                   abs=1e-5)

@@ -56,7 +56,7 @@ def test_undistortion_in_steps_equals_one_step() -> None:
     gray = clouds()
     once, _ = undistort_image(gray, K, 0.03)
     partly, _ = undistort_image(gray, K, 0.02)
-    twice, _ = undistort_image(partly, K, 0.03, before=0.02)
+    twice, _ = undistort_image(partly, K, 0.03, before=(K, 0.02))
     inner = np.s_[40:-40, 40:-40]
     assert np.abs(once.astype(int) - twice)[inner].max() <= 3
 

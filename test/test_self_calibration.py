@@ -1,4 +1,4 @@
-"""Online estimation of distortion: undetermined on straight roads, determined in turns."""
+"""Online calibration: a camera is undetermined on straight roads, and determined in turns."""
 
 from __future__ import annotations
 
@@ -13,10 +13,15 @@ from djet_ros.core.geometry import rotation_log
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Status, TRACKED
 from djet_ros.lab.scenes import make_scene, Scene
+from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import Messages
 from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.tracker import Outgoing, Tracker
+from djet_ros.odometry.visual_odometry import VisualOdometry
 from djet_ros.posegraph.step_messages import StepMessages
+from djet_ros.recordings.datasets import tum_rgbd
+from djet_ros.recordings.frame_sequence import FrameSequence
+from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.replay.graph_of_results import read_steps
 from djet_ros.replay.results import ResultsFolder
 import numpy as np
@@ -28,78 +33,118 @@ Numbers = NDArray[np.float64]
 
 K = np.array([[700.0, 0, 620], [0, 700, 180], [0, 0, 1]])
 
-# Pixels that a k1 of one leaves in the residuals of a window: see SelfCalibration.update.
-STRAIGHT, TURN = 0.5, 8.0
+# Sensitivities of windows, see SelfCalibration.update: on a straight road, and in a turn.
+STRAIGHT = np.diag([0.5, 1.0, 0.5, 0.5])**2
+_MIX = np.random.default_rng(0).normal(size=(4, 4))
+TURN = np.diag([8.0, 6.0, 8.0, 8.0]) @ (_MIX @ _MIX.T / 16 + np.eye(4)) @ np.diag(
+    [8.0, 6.0, 8.0, 8.0])
+
+WRONG = np.array([0.01, -0.005, 0.004, -0.003])
 
 
-def estimate(windows: list[tuple[float, float, float]]) -> SelfCalibration:
-    lens = SelfCalibration.unknown(K, (376, 1241))
-    for window in windows:
-        lens = lens.update(*window)
-    return lens
+def unknown() -> SelfCalibration:
+    return SelfCalibration.unknown(K, (376, 1241))
 
 
-def test_a_priori_there_is_no_distortion() -> None:
-    lens = SelfCalibration.unknown(K, (376, 1241))
-    assert lens.k1 == 0
-    # A priori the corner may be off by one percent.
+def after(found: SelfCalibration, seen: Numbers, sensitivity: Numbers, noise: float
+          ) -> SelfCalibration:
+    """Return an estimate after a window whose residuals are least at a deviation seen (4,)."""
+    return found.update(sensitivity, -sensitivity @ (seen - np.array(found.corrected)), noise**2)
+
+
+def noisy(rng: np.random.Generator, sensitivity: Numbers, noise: float) -> Numbers:
+    """Error (4,) of a window whose residuals have some noise along each axis."""
+    return np.asarray(noise * np.linalg.solve(np.linalg.cholesky(sensitivity).T,
+                                              rng.normal(size=4)))
+
+
+def test_a_priori_the_calibration_is_right() -> None:
+    found = unknown()
+    assert not any(found.deviation) and not found.significant
+    # A priori the distortion may displace the corner by one percent, and the camera matrix may be
+    # off by half a percent of the focal length.
     corner = np.array([1241 - 620, 376 - 180]) / 700
-    assert lens.sigma * (corner @ corner) == pytest.approx(0.01)
+    assert found.sigmas.k1 * (corner @ corner) == pytest.approx(0.01)
+    assert found.sigmas[1:] == pytest.approx([0.005] * 3)
 
 
-def test_a_systematic_error_on_straight_roads_is_not_taken_for_distortion() -> None:
-    lens = estimate([(0.02, 0.005**2, STRAIGHT)] * 500)
-    assert abs(lens.k1) < 0.005
-    assert lens.sigma > 0.5 * lens.prior_sigma
+def test_a_systematic_error_on_straight_roads_is_not_taken_for_a_wrong_calibration() -> None:
+    found = unknown()
+    for _ in range(500):
+        found = after(found, np.array([0.02, 0, 0, 0.01]), STRAIGHT, 0.002)
+        assert not found.significant
+    assert found.sigmas.k1 > 0.5 * found.prior_sigmas[0]
 
 
-def test_turns_separate_distortion_from_systematic_errors() -> None:
-    roads = [(0.02, 0.005**2, STRAIGHT)] * 50
-    lens = estimate(roads + [(0.01, 0.001**2, TURN)] * 20)
-    assert lens.k1 == pytest.approx(0.01, abs=2 * lens.sigma)
-    # 0.01 too much, where a k1 of one leaves half a pixel.
-    assert lens.mean[1] == pytest.approx(0.005, abs=2 * np.sqrt(lens.covariance[1, 1]))
-
-
-def test_noise_is_not_taken_for_distortion() -> None:
-    rng = np.random.default_rng(0)
+def test_turns_separate_a_wrong_calibration_from_systematic_errors() -> None:
+    found = unknown()
+    for _ in range(50):
+        found = after(found, WRONG + np.array([0.01, 0, 0, 0]), STRAIGHT, 0.002)
     for _ in range(20):
-        lens = estimate([(0.004 * rng.normal(), 0.004**2, TURN) for _ in range(30)])
-        assert abs(lens.k1) < 0.2 * lens.sigma
+        found = after(found, WRONG, TURN, 0.008)
+    errors = (np.array(found.deviation) - WRONG) / found.sigmas
+    assert np.abs(errors).max() < 2
+    # 0.01 too much, where a k1 of one leaves half a pixel.
+    assert found.mean[4] == pytest.approx(0.005, abs=2 * np.sqrt(found.covariance[4, 4]))
 
 
-def test_noise_free_windows_do_not_make_k1_certain() -> None:
-    # No lens deviates by k1 alone.
-    exact = estimate([(0.01, 0.0, TURN)] * 2)
-    assert exact.sigma > 0.1 * exact.prior_sigma
-    assert np.linalg.eigvalsh(exact.covariance)[0] > 0
+def test_the_estimate_is_as_uncertain_as_it_is_wrong() -> None:
+    rng, squares = np.random.default_rng(3), []
+    for _ in range(60):
+        wrong = unknown().prior_sigmas * rng.normal(size=4)
+        systematic = 0.01 * rng.normal(size=4)
+        found = unknown()
+        for sensitivity in (STRAIGHT, TURN, TURN):
+            scale = found.prior_sigmas
+            squares_of, axes = np.linalg.eigh(scale[:, None] * sensitivity * scale)
+            apparent = scale * (axes @ (axes.T @ systematic / np.sqrt(squares_of)))
+            # No camera deviates by these parameters alone: to each window another one is best.
+            other = 0.2 * scale * rng.normal(size=4)
+            found = after(found, wrong + other + apparent + noisy(rng, sensitivity, 0.01),
+                          sensitivity, 0.01)
+        error = (np.array(found.deviation) - wrong) / scale
+        squares.append(error @ np.linalg.solve(found.covariance[:4, :4], error))
+    # Chi^2 of four numbers, by 60 samples.
+    assert np.mean(squares) == pytest.approx(4, abs=3 * np.sqrt(8 / 60))
 
 
-def test_images_are_corrected_for_a_significant_k1_and_again_at_half_its_variance() -> None:
-    rng, lens, undone = np.random.default_rng(1), SelfCalibration.unknown(K, (376, 1241)), []
+def test_noise_free_windows_do_not_make_the_estimate_certain() -> None:
+    found = unknown()
+    for _ in range(2):
+        found = after(found, WRONG, TURN, 0.0)
+    assert (np.array(found.sigmas) > 0.05 * found.prior_sigmas).all()
+    assert np.linalg.eigvalsh(found.covariance)[0] > 0
+
+
+def test_a_direction_that_leaves_no_residual_stays_unknown() -> None:
+    turned = np.diag([8.0, 0.0, 8.0, 8.0])**2
+    found = after(unknown(), WRONG, turned, 0.01)
+    assert found.deviation.focal == 0 and found.sigmas.focal == pytest.approx(0.005)
+    assert found.covariance[5, 5] == pytest.approx(0.01**2)
+
+
+def test_images_are_corrected_for_what_is_significant_a_few_times_in_all() -> None:
+    rng, found, corrected = np.random.default_rng(1), unknown(), []
     for _ in range(300):
-        # Windows do not see what is corrected already.
-        lens = lens.update(0.01 - lens.corrected_k1 + 0.004 * rng.normal(), 0.004**2, TURN)
-        if lens.needs_update:
-            lens = lens.corrected()
-            undone.append((lens.corrected_k1, lens.sigma))
-            assert not lens.needs_update
-    sigmas = np.array([sigma for _, sigma in undone])
-    assert 2 <= len(undone) <= 6
-    assert undone[0][0] > 3 * sigmas[0]
-    assert (2 * sigmas[1:]**2 < sigmas[:-1]**2).all()
-    assert all(abs(k1 - 0.01) < 3 * sigma for k1, sigma in undone)
-    assert lens.residual_k1 == pytest.approx(0.01 - lens.corrected_k1, abs=3 * lens.sigma)
-    assert lens.k1 == pytest.approx(0.01, abs=2.5 * lens.sigma)
+        found = after(found, WRONG + noisy(rng, TURN, 0.03), TURN, 0.03)
+        if found.needs_update:
+            found = found.after_correction()
+            corrected.append(found)
+            assert not found.needs_update
+    assert 2 <= len(corrected) <= 8
+    for one in corrected:
+        error = (np.array(one.corrected) - WRONG) / one.prior_sigmas
+        assert error @ np.linalg.solve(one.covariance[:4, :4], error) < 18
+    assert np.abs((np.array(found.deviation) - WRONG) / found.sigmas).max() < 2.5
 
 
-def test_without_distortion_images_are_never_corrected() -> None:
+def test_noise_is_not_taken_for_a_wrong_calibration() -> None:
     rng = np.random.default_rng(2)
     for _ in range(20):
-        lens = SelfCalibration.unknown(K, (376, 1241))
+        found = unknown()
         for _ in range(100):
-            lens = lens.update(0.004 * rng.normal(), 0.004**2, TURN)
-            assert not lens.needs_update
+            found = after(found, noisy(rng, TURN, 0.03), TURN, 0.03)
+            assert not found.needs_update
 
 
 @cache
@@ -152,13 +197,17 @@ def tracked_bent(bent: Bent) -> tuple[Tracker, list[OdometryResult]]:
 
 
 @pytest.mark.slow
-def test_remaining_distortion_is_estimated_in_a_turn_and_reported(
+def test_what_is_wrong_is_estimated_in_a_turn_and_reported(
         bent: Bent, tracked_bent: tuple[Tracker, list[OdometryResult]]) -> None:
     tracker, results = tracked_bent
-    found, sigma = map(float, tracker.diagnosis().values['distortion left (k1)'].split(' +- '))
+    text = tracker.diagnosis().values['calibration off by']
+    found, sigma = map(float, text.split(',')[0].removeprefix('k1 = ').split(' +- '))
     assert found == pytest.approx(0.015, abs=2.5 * sigma)
     assert sigma < 0.003
-    assert [one.name for one in tracker.complaints_of_content] == ['distortion left']
+    focal, of_focal = map(float, text.split(', ')[1].removeprefix('focal length ').removesuffix(
+        ' %').split(' +- '))
+    assert focal == pytest.approx(0, abs=2.5 * of_focal)
+    assert [one.name for one in tracker.complaints_of_content] == ['calibration off']
     # Poses of pairs are unchanged until it is significant, and better from then on, as images are
     # corrected; without a scale by landmarks it is not estimated.
     _, unknowing = bent.tracked(scale='none')
@@ -172,14 +221,14 @@ def test_remaining_distortion_is_estimated_in_a_turn_and_reported(
 
 
 @pytest.mark.slow
-def test_the_back_end_gets_the_lens_of_each_image(
+def test_the_back_end_gets_the_correction_of_each_image(
         tracked_bent: tuple[Tracker, list[OdometryResult]], tmp_path: Path) -> None:
     """Loops are the same live, by messages, and later, by results."""
     _, results = tracked_bent
-    lenses = [one.k1 for one in results]
-    assert not any(lenses[:30])
+    corrections = [one.camera_correction for one in results]
+    assert not any(map(any, corrections[:30]))
     # The significant part of it.
-    assert 0 < lenses[-1] < 0.018
+    assert 0 < corrections[-1].k1 < 0.018
     make, estimate, live = Messages(message_type, OdometryConfig()), StepMessages('body'), []
     with ResultsFolder(tmp_path / 'results', Config()) as folder:
         for number, one in enumerate(results):
@@ -189,21 +238,22 @@ def test_the_back_end_gets_the_lens_of_each_image(
                 message = make.relative_pose_cov(one)
                 folder.publish(Outgoing('relative_pose_cov', message), one.stamp_ns)
                 live += estimate.relative_pose(message)
-    assert [step.k1 for step in live] == lenses
-    assert [step.k1 for step in read_steps(tmp_path / 'results')] == lenses
+    assert [step.camera_correction for step in live] == corrections
+    assert [step.camera_correction for step in read_steps(
+        tmp_path / 'results')] == corrections
 
 
 @pytest.mark.slow
 def test_the_estimate_is_reset_with_another_camera(bent: Bent) -> None:
     tracker, _ = bent.tracked()
-    assert 'distortion left (k1)' in tracker.diagnosis().values
+    assert 'calibration off by' in tracker.diagnosis().values
     # The same camera sends it again, as drivers do.
     tracker.camera_info(camera_info(bent.K, bent.size))
-    assert 'distortion left (k1)' in tracker.diagnosis().values
+    assert 'calibration off by' in tracker.diagnosis().values
     other = camera_info(bent.K, bent.size)
     other.d = [0.001, 0.0, 0.0, 0.0, 0.0]
     tracker.camera_info(other)
-    assert 'distortion left (k1)' not in tracker.diagnosis().values
+    assert 'calibration off by' not in tracker.diagnosis().values
     tracker.image(image(bent.images[-1], stamp_ns=10**10))
     assert tracker.last is not None and tracker.last.status in (Status.OK, Status.TIME_JUMP)
 
@@ -223,5 +273,44 @@ def test_corrected_images_are_reproducible_to_the_last_bit(
 @pytest.mark.slow
 def test_a_good_calibration_is_not_reported() -> None:
     tracker, _ = Bent(0.0).tracked()
-    assert 'distortion left (k1)' not in tracker.diagnosis().values
+    assert 'calibration off by' not in tracker.diagnosis().values
     assert tracker.complaints_of_content == []
+
+
+def through(sequence: FrameSequence, **odometry: Any
+            ) -> tuple[VisualOdometry, list[OdometryResult]]:
+    one = VisualOdometry(odometry=OdometryConfig(**odometry))
+    return one, [one.process(Frame(sequence.image(i), sequence.K, (i + 1) * 10**8))
+                 for i in range(len(sequence))]
+
+
+def aside(motion: Numbers) -> float:
+    """Degrees by which a motion (4, 4) goes to the right."""
+    return float(np.degrees(motion[0, 3] / np.linalg.norm(motion[:3, 3])))
+
+
+@pytest.mark.slow
+def test_in_a_real_turn_the_calibration_is_corrected_and_motion_is_as_the_vehicle_has_it(
+        kitti: Path) -> None:
+    """Directions of the vehicle are those of its GPS and inertial sensors, not of images."""
+    sequence = KittiSequence(kitti / 'sequences' / '03', start=60, end=230)
+    (odometry, corrected), (_, calibrated) = through(sequence), through(sequence, scale='none')
+    assert odometry.calibration is not None
+    first = next(i for i, one in enumerate(corrected) if any(one.camera_correction))
+    assert first < 60
+    assert sequence.poses is not None
+    true = [np.linalg.inv(before) @ after for before, after in pairwise(sequence.poses)]
+    off, unknowing = (np.median([aside(one.motion) - aside(motion)
+                                 for one, motion in zip(results[1:], true, strict=True)][first:])
+                      for results in (corrected, calibrated))
+    assert abs(off) < abs(unknowing) / 2
+
+
+@pytest.mark.slow
+def test_exact_and_trembling_cameras_are_not_corrected(corridor: Path, freiburg1_rpy: Path
+                                                       ) -> None:
+    """Of TartanAir the calibration is exact; TUM's has a rolling shutter, which is no lens."""
+    for sequence in (KittiSequence(corridor), tum_rgbd(freiburg1_rpy)):
+        odometry, results = through(sequence)
+        assert odometry.calibration is None
+        assert not any(any(one.camera_correction) for one in results)

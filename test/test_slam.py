@@ -10,6 +10,7 @@ from cards import Cards, K, pose
 from commands import checked as djet
 import cv2
 from djet_ros.config.sections import Config, SlamConfig
+from djet_ros.core.correction import Correction
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_angle, rotation_exp, unit
@@ -398,9 +399,9 @@ def test_loop_uses_the_newest_distortion_of_the_odometry():
         finder, errors = EdgeFinder(EstimatorConfig(), SlamConfig(loop_gap=0.25)), []
         for i, here in enumerate(poses):
             frame = cards.frame(1 + 0.1 * i, here, noise=i)
-            seen = undistort_image(frame.gray, K, 0.0, before=k1)[0] if bends else frame.gray
+            seen = undistort_image(frame.gray, K, 0.0, before=(K, k1))[0] if bends else frame.gray
             finder.add(replace(frame, gray=seen), edges[i - 1] if i else None,
-                       k1 if known and i > 3 else 0.0)
+                       Correction(k1 if known and i > 3 else 0.0))
             for loop in finder.loops(i) if i > 3 else ():
                 true = np.linalg.inv(poses[i]) @ poses[loop.target]
                 assert loop.scale_known

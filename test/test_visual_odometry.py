@@ -4,6 +4,7 @@ from dataclasses import replace
 
 from cards import Cards, K, pose
 from djet_ros.config.sections import OdometryConfig
+from djet_ros.core.correction import Correction
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import direction_angle, rotation_angle, rotation_exp, unit
@@ -659,14 +660,14 @@ def test_a_frame_that_is_refused_leaves_no_trace(cards):
 
 
 @pytest.mark.parametrize('gap', [0.1, 60.0])
-def test_the_estimated_distortion_is_forgotten_for_another_camera(cards, gap):
+def test_the_correction_of_a_camera_is_forgotten_for_another_one(cards, gap):
     vo = odometry()
     drive(vo, cards, [np.eye(4), STEP, STEP])
-    vo._undistort(0.02)
+    vo._correct(Correction(0.02, 0.01))
     frame = cards.frame(0.2 + gap, STEP)
     result = vo.process(replace(frame, gray=frame.gray[:-20].copy()))
     assert result.status is (Status.SIZE_CHANGED if gap < 1 else Status.TIME_JUMP)
-    assert vo.estimator.k1 == 0
+    assert not any(vo.estimator.correction)
 
 
 def test_a_wrong_motion_at_the_start_does_not_last(corridor):

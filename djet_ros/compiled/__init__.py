@@ -27,7 +27,7 @@ Images = Sequence[tuple[NDArray[Any], int]]
 
 # Version of the C interface, see interface.c: an editable install may have newer sources than its
 # build.
-_INTERFACE = 11
+_INTERFACE = 12
 
 _NO_BYTES = c_char * 0
 _FLOAT64 = np.dtype(np.float64)
@@ -40,6 +40,9 @@ _CORNER_ROWS, _PLANE_ROWS = 12, 14
 
 # Terms summed over the matches of a cell.
 _TERMS = 27
+
+# Parameters of a correction of the camera, as in bundle.c.
+_OF_CAMERA = 4
 
 
 def _loaded() -> ctypes.CDLL | None:
@@ -370,15 +373,15 @@ def leave_one_out(H: Array, sums: Array) -> tuple[Array, Array]:
 
 def observe(observations: tuple[NDArray[np.int64], NDArray[np.int64]], anchors: NDArray[np.int64],
             between: tuple[Array, Array], landmarks: tuple[Array, ...], K: tuple[Array, Array],
-            tuning: Sequence[float]) -> tuple[NDArray[np.int64], tuple[Array, ...]]:
+            limits: Sequence[float]) -> tuple[NDArray[np.int64], tuple[Array, ...]]:
     """
     Return residuals of M observations of N landmarks by F frames: `core.bundle.observe`.
 
     observations: landmark and frame of each (M,); anchors: (N,); between: R (F, F, 3, 3) and t (F,
     F, 3); landmarks: points (N, 2), rho (N,), minima (N, F, 2), roots (N, F, 2, 2), anchor_roots
-    (N, 2, 2) and anchor_pixels (N, 2); K: (3, 3) and its inverse; tuning: k1, least depth, largest
-    relative displacement by k1, and bound of pixels. Returns anchors (M,), and an Observed's
-    residuals, anchor_residuals, normalised, R, t, ray, rho, place and root.
+    (N, 2, 2) and anchor_pixels (N, 2); K: (3, 3) and its inverse; limits: least depth, and bound
+    of pixels. Returns anchors (M,), and an Observed's residuals, anchor_residuals, normalised, R,
+    t, ray, rho, place and root.
     """
     m, n, frames = len(observations[0]), len(anchors), len(between[0])
     anchor = np.empty(m, np.int64)
@@ -386,33 +389,33 @@ def observe(observations: tuple[NDArray[np.int64], NDArray[np.int64]], anchors: 
         (m, 2), (n, 2), (n, 2), (m, 3, 3), (m, 3), (m, 3), m, (m, 3), (m, 2, 2)))
     _call('djet_observe', c_int(m), c_int(n), c_int(frames),
           *(_ptr(one, np.int64) for one in (*observations, anchors)), *map(_ptr, between),
-          *map(_ptr, landmarks), *map(_ptr, K), _ptr(np.array(tuning, float)),
+          *map(_ptr, landmarks), *map(_ptr, K), _ptr(np.array(limits, float)),
           _ptr(anchor, np.int64), *map(_ptr, results))
     return anchor, results
 
 
 def eliminate(indices: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]],
               observed: tuple[Array, ...], points: tuple[Array, Array, Array, float],
-              with_k1: bool, K: tuple[Array, Array], tuning: Sequence[float],
-              depth_information: float, frames: int) -> tuple[Array, Array, Array, Array, Array]:
+              K: tuple[Array, Array], limits: Sequence[float], depth_information: float,
+              frames: int) -> tuple[Array, Array, Array, Array, Array]:
     """
     Sum the normal equations of M observations, and eliminate N landmarks: `core.bundle.eliminate`.
 
     indices: landmark, frame and anchor of each (M,), sorted by landmark; observed: residuals (M,
     2), R (M, 3, 3), t, ray (M, 3), rho (M,), place (M, 3), root (M, 2, 2) and weights (M,);
     points: normalised (N, 2), anchor_roots (N, 2, 2), anchor_residuals (N, 2) and their weight;
-    with_k1: whether k1 is a parameter; K, tuning: as in `observe`; depth_information: added to a
-    landmark; frames: F. Returns the arrays of a Reduced.
+    K, limits: as in `observe`; depth_information: added to a landmark; frames: F. Returns the
+    arrays of a Reduced.
     """
     *of_points, weight = points
-    n, size = len(of_points[0]), with_k1 + 6 * frames
+    n, size = len(of_points[0]), _OF_CAMERA + 6 * frames
     H, g = np.zeros((size, size)), np.zeros(size)
     coupling, variances = np.zeros((n, 3, size)), np.empty((n, 3, 3))
     slopes, gain = np.zeros((n, 3)), np.empty((3, size))
-    _call('djet_eliminate', c_int(len(indices[0])), c_int(n), c_int(frames), c_int(with_k1),
+    _call('djet_eliminate', c_int(len(indices[0])), c_int(n), c_int(frames),
           *(_ptr(one, np.int64) for one in indices), *map(_ptr, observed),
           *map(_ptr, of_points), c_double(weight), *map(_ptr, K),
-          _ptr(np.array(tuning, float)), c_double(depth_information),
+          _ptr(np.array(limits, float)), c_double(depth_information),
           *map(_ptr, (H, g, coupling, variances, slopes, gain)))
     return H, g, coupling, variances, slopes
 

@@ -10,100 +10,75 @@ typedef struct {
     double u[2], e[2], by_frame[2][6], by_anchor[2][6], by_own[2][3];
 } Row;
 
-/* A camera (3, 3) and its inverse, its lens, and the limits of projections: see core/bundle.py
-   and core/radial.py. */
+/* A camera matrix (3, 3) and its inverse, and the limits of projections: see core/bundle.py. */
 typedef struct {
     const double *K, *K_inverse;
-    double k1, nearest, farthest, far_out;
-} Lens;
+    double nearest, far_out;
+} Camera;
 
-static Lens lens_of(const double *K, const double *K_inverse, const double tuning[4])
-{
-    const Lens lens = {K, K_inverse, tuning[0], tuning[1], tuning[2], tuning[3]};
-    return lens;
-}
+/* Parameters of a correction of the camera: see core/correction.py. */
+enum { OF_CAMERA = 4 };
 
 INLINE double limited(double value, double most)
 {
     return value > most ? most : value < -most ? -most : value;
 }
 
-/* radial.stretch. */
-INLINE double stretch(const Lens *lens, const double u[2])
+INLINE double depth_of(const Camera *camera, const double place[3])
 {
-    return 1 + limited(lens->k1 * (u[0] * u[0] + u[1] * u[1]), lens->farthest);
-}
-
-INLINE double depth_of(const Lens *lens, const double place[3])
-{
-    return place[2] > lens->nearest ? place[2] : lens->nearest;
+    return place[2] > camera->nearest ? place[2] : camera->nearest;
 }
 
 /* The residual (2,) of a point and an observed pixel, whitened by a root (2, 2). */
-INLINE void whitened_residual(const Lens *lens, const double place[3], const double pixel[2],
-                         const double *root, double *residual)
+INLINE void whitened_residual(const Camera *camera, const double place[3], const double pixel[2],
+                              const double *root, double *residual)
 {
-    const double depth = depth_of(lens, place), u[2] = {place[0] / depth, place[1] / depth};
-    const double factor = stretch(lens, u), x = u[0] * factor, y = u[1] * factor;
+    const double depth = depth_of(camera, place), x = place[0] / depth, y = place[1] / depth;
     double error[2];
     for (int i = 0; i < 2; i++) {
-        const double *row = lens->K + 3 * i;
-        error[i] = limited(row[0] * x + row[1] * y + row[2], lens->far_out) - pixel[i];
+        const double *row = camera->K + 3 * i;
+        error[i] = limited(row[0] * x + row[1] * y + row[2], camera->far_out) - pixel[i];
     }
     for (int i = 0; i < 2; i++)
         residual[i] = root[2 * i] * error[0] + root[2 * i + 1] * error[1];
 }
 
-/* bundle._by_undistorted, of one root (2, 2) at u. */
-INLINE void by_undistorted(const Lens *lens, const double u[2], const double *root,
-                           double whitened[4])
+/* bundle._by_camera, of one root (2, 2) at u, times a factor. */
+INLINE void by_camera(const Camera *camera, const double u[2], const double *root, double factor,
+                      double derivatives[2][OF_CAMERA])
 {
-    const double *K = lens->K, *K_inverse = lens->K_inverse, factor = stretch(lens, u);
+    const double *K = camera->K, squared = u[0] * u[0] + u[1] * u[1];
     for (int i = 0; i < 2; i++) {
-        double row[2], distorted[2];
-        for (int j = 0; j < 2; j++)
-            row[j] = root[2 * i] * K[j] + root[2 * i + 1] * K[3 + j];
-        const double along = 2 * lens->k1 * (row[0] * u[0] + row[1] * u[1]);
-        for (int j = 0; j < 2; j++)
-            distorted[j] = along * u[j] + factor * row[j];
-        for (int j = 0; j < 2; j++)
-            whitened[2 * i + j] = distorted[0] * K_inverse[j] + distorted[1] * K_inverse[3 + j];
+        double *row = derivatives[i];
+        row[2] = factor * (root[2 * i] * K[0] + root[2 * i + 1] * K[3]);
+        row[3] = factor * (root[2 * i] * K[1] + root[2 * i + 1] * K[4]);
+        row[1] = row[2] * u[0] + row[3] * u[1];
+        row[0] = row[1] * squared;
     }
-}
-
-/* bundle._by_k1, of one root (2, 2) at u. */
-INLINE void by_k1(const Lens *lens, const double u[2], const double *root, double derivatives[2])
-{
-    const double *K = lens->K, squared = u[0] * u[0] + u[1] * u[1];
-    const double x = squared * (K[0] * u[0] + K[1] * u[1]);
-    const double y = squared * (K[3] * u[0] + K[4] * u[1]);
-    for (int i = 0; i < 2; i++)
-        derivatives[i] = root[2 * i] * x + root[2 * i + 1] * y;
 }
 
 /* bundle.observe: M observations of N landmarks by F frames. points: (N, 2) in the anchors;
    R_between (F, F, 3, 3) and t_between (F, F, 3) lead from each frame (second index) to each
-   other one; minima (N, F, 2), roots (N, F, 2, 2); tuning: k1, least depth, largest relative
-   displacement by k1, and bound of pixels. Writes the anchor of each observation, and the fields
-   of a bundle.Observed. */
+   other one; minima (N, F, 2), roots (N, F, 2, 2); limits: least depth, and bound of pixels.
+   Writes the anchor of each observation, and the fields of a bundle.Observed. */
 WIDE void djet_observe(int M, int N, int F, const int64_t *landmark, const int64_t *frame,
                        const int64_t *anchors, const double *R_between, const double *t_between,
                        const double (*points)[2], const double *depths, const double *minima,
                        const double *roots, const double *anchor_roots,
                        const double (*anchor_pixels)[2], const double *K, const double *K_inverse,
-                       const double *tuning, int64_t *anchor, double (*residuals)[2],
+                       const double *limits, int64_t *anchor, double (*residuals)[2],
                        double (*anchor_residuals)[2], double (*normalised)[2], double (*R)[9],
                        double (*t)[3], double (*ray)[3], double *rho, double (*place)[3],
                        double (*root)[4])
 {
-    const Lens lens = lens_of(K, K_inverse, tuning);
+    const Camera camera = {K, K_inverse, limits[0], limits[1]};
     for (int n = 0; n < N; n++) {
         double ray_of_point[3] = {0, 0, 1};
         for (int i = 0; i < 2; i++)
             ray_of_point[i] = normalised[n][i] = points[n][0] * K_inverse[3 * i]
                                                  + points[n][1] * K_inverse[3 * i + 1]
                                                  + K_inverse[3 * i + 2];
-        whitened_residual(&lens, ray_of_point, anchor_pixels[n], anchor_roots + 4 * n,
+        whitened_residual(&camera, ray_of_point, anchor_pixels[n], anchor_roots + 4 * n,
                           anchor_residuals[n]);
     }
     for (int m = 0; m < M; m++) {
@@ -120,13 +95,8 @@ WIDE void djet_observe(int M, int N, int F, const int64_t *landmark, const int64
         for (int i = 0; i < 3; i++)
             place[m][i] = R[m][3 * i] * ray[m][0] + R[m][3 * i + 1] * ray[m][1]
                           + R[m][3 * i + 2] + rho[m] * t[m][i];
-        whitened_residual(&lens, place[m], minima + 2 * observation, root[m], residuals[m]);
+        whitened_residual(&camera, place[m], minima + 2 * observation, root[m], residuals[m]);
     }
-}
-
-INLINE int64_t smaller(int64_t a, int64_t b)
-{
-    return a < b ? a : b;
 }
 
 INLINE int64_t larger(int64_t a, int64_t b)
@@ -142,20 +112,18 @@ static void cross(const double a[3], const double b[3], double product[3])
 }
 
 /* bundle.jacobians of one observation, times a factor. */
-static void differentiate(const Lens *lens, const double *residuals, const double *R,
+static void differentiate(const Camera *camera, const double *residuals, const double *R,
                           const double *t, const double *ray, double rho, const double *place,
                           const double *root, double factor, Row *row)
 {
-    const double *K = lens->K, *K_inverse = lens->K_inverse, depth = depth_of(lens, place);
-    double whitened[4];
+    const double *K = camera->K, *K_inverse = camera->K_inverse, depth = depth_of(camera, place);
     row->u[0] = place[0] / depth;
     row->u[1] = place[1] / depth;
-    by_undistorted(lens, row->u, root, whitened);
     for (int i = 0; i < 2; i++) {
         double by_place[3], by_ray[3];
         for (int j = 0; j < 2; j++)
             by_place[j] =
-                factor * (whitened[2 * i] * K[j] + whitened[2 * i + 1] * K[3 + j]) / depth;
+                factor * (root[2 * i] * K[j] + root[2 * i + 1] * K[3 + j]) / depth;
         by_place[2] = -(by_place[0] * place[0] + by_place[1] * place[1]) / depth;
         for (int j = 0; j < 3; j++)
             by_ray[j] = by_place[0] * R[j] + by_place[1] * R[3 + j] + by_place[2] * R[6 + j];
@@ -198,74 +166,65 @@ static void invert(const double *A, double *inverse)
     inverse[8] = 1 / d2;
 }
 
-/* Eliminate a landmark from the equations over the poses (Schur complement). C: (3, size)
-   couples it with them, and is zero outside of columns [from, to). */
-INLINE void eliminate(int64_t size, int64_t from, int64_t to, const double *C,
-                      const double *variances, const double *slopes, double *gain, double *H,
-                      double *g)
+/* Eliminate a landmark from the equations over camera and poses (Schur complement). C: (3, size)
+   couples it with them, and is zero from column `end` on. */
+INLINE void eliminate(int64_t size, int64_t end, const double *C, const double *variances,
+                      const double *slopes, double *gain, double *H, double *g)
 {
     for (int i = 0; i < 3; i++)
-        for (int64_t k = from; k < to; k++)
+        for (int64_t k = 0; k < end; k++)
             gain[i * size + k] = variances[3 * i] * C[k] + variances[3 * i + 1] * C[size + k]
                                  + variances[3 * i + 2] * C[2 * size + k];
-    for (int64_t j = from; j < to; j++) {
+    for (int64_t j = 0; j < end; j++) {
         const double a = gain[j], b = gain[size + j], c = gain[2 * size + j];
         if (a == 0 && b == 0 && c == 0)
             continue;
         g[j] -= a * slopes[0] + b * slopes[1] + c * slopes[2];
-        for (int64_t k = from; k < to; k++)
+        for (int64_t k = 0; k < end; k++)
             H[j * size + k] -= a * C[k] + b * C[size + k] + c * C[2 * size + k];
     }
 }
 
 /* bundle.eliminate: M observations of N landmarks by F frames, sorted by landmark. Adds to H
-   (S, S), g (S,), coupling (N, 3, S) and slopes (N, 3), with S = 6F for the poses, and one
-   before them if k1 is a parameter; writes variances (N, 3, 3); gain: (3, S) scratch memory;
-   tuning: see djet_observe. */
-WIDE void djet_eliminate(int M, int N, int F, int with_k1, const int64_t *landmark,
-                         const int64_t *frame, const int64_t *anchor, const double *residuals,
+   (S, S), g (S,), coupling (N, 3, S) and slopes (N, 3), with S = OF_CAMERA + 6F; writes
+   variances (N, 3, 3); gain: (3, S) scratch memory; limits: see djet_observe. */
+WIDE void djet_eliminate(int M, int N, int F, const int64_t *landmark, const int64_t *frame,
+                         const int64_t *anchor, const double *residuals,
                          const double *R, const double *t, const double *ray, const double *rho,
                          const double *place, const double *root, const double *weights,
                          const double (*normalised)[2], const double *anchor_roots,
                          const double *anchor_residuals, double weight, const double *K,
-                         const double *K_inverse, const double *tuning, double depth_information,
+                         const double *K_inverse, const double *limits, double depth_information,
                          double *H, double *g, double *coupling, double *variances, double *slopes,
                          double *gain)
 {
-    const Lens lens = lens_of(K, K_inverse, tuning);
-    const int64_t size = with_k1 + 6 * (int64_t)F;
+    const Camera camera = {K, K_inverse, limits[0], limits[1]};
+    const int64_t size = OF_CAMERA + 6 * (int64_t)F;
     for (int n = 0, m = 0; n < N; n++) {
         double information[9] = {
             [0] = depth_information, [4] = depth_information, [8] = depth_information};
-        double by_point[4], by_lens[2];
         double *C = coupling + 3 * size * n, *slope = slopes + 3 * n;
-        const double *anchor_residual = anchor_residuals + 2 * n;
-        by_undistorted(&lens, normalised[n], anchor_roots + 4 * n, by_point);
-        by_k1(&lens, normalised[n], anchor_roots + 4 * n, by_lens);
-        /* Range of columns of the frames that observe the landmark. */
-        int64_t from = with_k1 ? 0 : size, to = with_k1;
-        if (with_k1) {
-            H[0] += weight * (by_lens[0] * by_lens[0] + by_lens[1] * by_lens[1]);
-            g[0] += weight * (by_lens[0] * anchor_residual[0] + by_lens[1] * anchor_residual[1]);
-        }
-        for (int i = 0; i < 2; i++) {
-            const double *column = by_point + i;
-            for (int j = 0; j < 2; j++)
-                information[3 * (i + 1) + j + 1] +=
-                    weight * (column[0] * by_point[j] + column[2] * by_point[2 + j]);
-            slope[i + 1] +=
-                weight * (column[0] * anchor_residual[0] + column[2] * anchor_residual[1]);
-            if (with_k1)
-                C[(i + 1) * size] += weight * (column[0] * by_lens[0] + column[2] * by_lens[1]);
-        }
+        const double *by_point = anchor_roots + 4 * n, root_of_common = sqrt(weight);
+        double own[4], residual[2], moved[2][OF_CAMERA];
+        for (int i = 0; i < 4; i++)
+            own[i] = root_of_common * by_point[i];
+        for (int i = 0; i < 2; i++)
+            residual[i] = root_of_common * anchor_residuals[2 * n + i];
+        add_block(information + 4, 3, own, 2, own, 2);
+        add_block(slope + 1, 1, own, 2, residual, 1);
+        by_camera(&camera, normalised[n], by_point, root_of_common, moved);
+        add_block(H, size, moved[0], OF_CAMERA, moved[0], OF_CAMERA);
+        add_block(g, 1, moved[0], OF_CAMERA, residual, 1);
+        add_block(C + size, size, own, 2, moved[0], OF_CAMERA);
+        /* Past the columns of the frames that observe the landmark. */
+        int64_t end = OF_CAMERA;
         for (; m < M && landmark[m] == n; m++) {
             const double root_of_weight = sqrt(weights[m]);
             Row row;
-            differentiate(&lens, residuals + 2 * m, R + 9 * m, t + 3 * m, ray + 3 * m, rho[m],
+            differentiate(&camera, residuals + 2 * m, R + 9 * m, t + 3 * m, ray + 3 * m, rho[m],
                           place + 3 * m, root + 4 * m, root_of_weight, &row);
-            const int64_t f = with_k1 + 6 * frame[m], a = with_k1 + 6 * anchor[m];
-            from = smaller(from, smaller(f, a));
-            to = larger(to, larger(f, a) + 6);
+            const int64_t f = OF_CAMERA + 6 * frame[m], a = OF_CAMERA + 6 * anchor[m];
+            end = larger(end, larger(f, a) + 6);
             const double *by_frame = row.by_frame[0], *by_anchor = row.by_anchor[0],
                          *by_own = row.by_own[0];
             add_block(H + f * size + f, size, by_frame, 6, by_frame, 6);
@@ -278,21 +237,16 @@ WIDE void djet_eliminate(int M, int N, int F, int with_k1, const int64_t *landma
             add_block(C + a, size, by_own, 3, by_anchor, 6);
             add_block(information, 3, by_own, 3, by_own, 3);
             add_block(slope, 1, by_own, 3, row.e, 1);
-            if (with_k1) {
-                double k1[2];
-                by_k1(&lens, row.u, root + 4 * m, k1);
-                k1[0] *= root_of_weight;
-                k1[1] *= root_of_weight;
-                add_block(H, size, k1, 1, k1, 1);
-                add_block(H + f, size, k1, 1, by_frame, 6);
-                add_block(H + a, size, k1, 1, by_anchor, 6);
-                add_block(H + f * size, size, by_frame, 6, k1, 1);
-                add_block(H + a * size, size, by_anchor, 6, k1, 1);
-                add_block(g, 1, k1, 1, row.e, 1);
-                add_block(C, size, by_own, 3, k1, 1);
-            }
+            by_camera(&camera, row.u, root + 4 * m, root_of_weight, moved);
+            add_block(H, size, moved[0], OF_CAMERA, moved[0], OF_CAMERA);
+            add_block(H + f, size, moved[0], OF_CAMERA, by_frame, 6);
+            add_block(H + a, size, moved[0], OF_CAMERA, by_anchor, 6);
+            add_block(H + f * size, size, by_frame, 6, moved[0], OF_CAMERA);
+            add_block(H + a * size, size, by_anchor, 6, moved[0], OF_CAMERA);
+            add_block(g, 1, moved[0], OF_CAMERA, row.e, 1);
+            add_block(C, size, by_own, 3, moved[0], OF_CAMERA);
         }
         invert(information, variances + 9 * n);
-        eliminate(size, from, to, C, variances + 9 * n, slope, gain, H, g);
+        eliminate(size, end, C, variances + 9 * n, slope, gain, H, g);
     }
 }

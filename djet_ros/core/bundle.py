@@ -13,9 +13,8 @@ too: the landmark's ray there is free, with a residual like the others. With a f
 would have to absorb that noise, and steps would be biased short, ever more.
 
 Poses are world to camera, ``X_camera = R X_world + t``, perturbed from the left: a step (omega,
-upsilon) makes them ``exp(omega) R`` and ``exp(omega) t + upsilon``. All frames share one lens,
-whose calibration may leave some radial distortion: it moves points u = (X/Z, Y/Z) to u (1 + k1
-|u|^2).
+upsilon) makes them ``exp(omega) R`` and ``exp(omega) t + upsilon``. All frames share one camera,
+whose deviation from its calibration (`core.correction`) is among the parameters.
 """
 
 from __future__ import annotations
@@ -25,9 +24,10 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 from djet_ros import compiled
+from djet_ros.core.correction import Correction, displacements
 from djet_ros.core.geometry import inverse_intrinsics, rays, rotation_exp, rotation_log
 from djet_ros.core.paraboloid import median, times
-from djet_ros.core.radial import distort, distortion_jacobian, FARTHEST, stretch, undistort
+from djet_ros.core.radial import distort, distortion_jacobian, undistort
 from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +35,14 @@ from numpy.typing import NDArray
 # Least depth of a projection, in units of the landmark's depth in its anchor.
 _MIN_DEPTH = 1e-3
 
+# Parameters of the camera.
+_OF_CAMERA = len(Correction._fields)
+
 # Bound of projected pixels; it fits into an integer.
 _MAX_PIXEL = 1e6
+
+# Limits of projections, as compiled code takes them.
+_LIMITS = _MIN_DEPTH, _MAX_PIXEL
 
 # Information that fixes a pose.
 _FIXED = 1e10
@@ -53,11 +59,10 @@ _GAUGE = 1e-7
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses of F frames: R (F, 3, 3), t (F, 3), and the k1 of their lens, see the module."""
+    """Poses of F frames: R (F, 3, 3), t (F, 3)."""
 
     R: Array
     t: Array
-    k1: float = 0.0
 
     @cached_property
     def relative_motions(self) -> tuple[Array, Array]:
@@ -74,18 +79,17 @@ class Poses:
 
     def joined(self, R: Array, t: Array) -> Poses:
         """Return the poses with one more, R (3, 3) and t (3,)."""
-        return Poses(np.concatenate([self.R, R[None]]), np.concatenate([self.t, t[None]]),
-                     self.k1)
+        return Poses(np.concatenate([self.R, R[None]]), np.concatenate([self.t, t[None]]))
 
     def without_frame(self, frame: int) -> Poses:
         """Return the poses without a frame."""
-        return Poses(np.delete(self.R, frame, axis=0), np.delete(self.t, frame, axis=0), self.k1)
+        return Poses(np.delete(self.R, frame, axis=0), np.delete(self.t, frame, axis=0))
 
     def moved(self, step: Array) -> Poses:
         """Return the poses perturbed by a step (6 F,)."""
         step = step.reshape(-1, 6)
         rotations = rotation_exp(step[:, :3])
-        return Poses(rotations @ self.R, times(rotations, self.t) + step[:, 3:], self.k1)
+        return Poses(rotations @ self.R, times(rotations, self.t) + step[:, 3:])
 
     def step_from(self, other: Poses) -> Array:
         """Return the step (6 F,) that takes other poses to these, to first order."""
@@ -104,9 +108,12 @@ class PriorCost(NamedTuple):
 @dataclass
 class PosePrior:
     """
-    Prior on F poses, in addition to their landmarks.
+    Prior on a camera and F poses, in addition to their landmarks.
 
-    It costs 1/2 d^T H d + g^T d, with d the step (6 F,) from the poses `linearised_at`.
+    It costs 1/2 d^T H d + g^T d, with d (4 + 6 F,) the fields of a `Correction`, and the step from
+    the poses `linearised_at`. The camera is fixed while poses are refined, but how poses depend on
+    it is kept (a "consider" parameter; Schmidt, 1966): once more is known of the camera, they are
+    corrected, even for what frames since removed had said.
     """
 
     H: Array
@@ -116,18 +123,28 @@ class PosePrior:
     @classmethod
     def holding(cls, pose: Poses) -> PosePrior:
         """Return a prior that fixes the first pose."""
-        return cls(np.eye(6) * _FIXED, np.zeros(6), pose)
+        return cls(np.diag(np.repeat([0.0, _FIXED], [_OF_CAMERA, 6])), np.zeros(_OF_CAMERA + 6),
+                   pose)
+
+    @property
+    def of_poses(self) -> Array:
+        """Return the Hessian (6 F, 6 F) over the poses."""
+        return self.H[_OF_CAMERA:, _OF_CAMERA:]
 
     def at(self, poses: Poses) -> PriorCost:
         """Return the cost of poses and its gradient."""
-        step = poses.step_from(self.linearised_at)
-        pull = self.H @ step
-        return PriorCost(float(step @ (pull / 2 + self.g)), np.asarray(self.g + pull))
+        step, g = poses.step_from(self.linearised_at), self.g[_OF_CAMERA:]
+        pull = self.of_poses @ step
+        return PriorCost(float(step @ (pull / 2 + g)), np.asarray(g + pull))
 
     def add(self, H: Array, g: Array, poses: Poses) -> None:
-        """Add information H, g linearised at `poses`."""
+        """Add information H (4 + 6 F, 4 + 6 F), g linearised at `poses`."""
         self.H += H
-        self.g += g - H @ poses.step_from(self.linearised_at)
+        self.g += g - H[:, _OF_CAMERA:] @ poses.step_from(self.linearised_at)
+
+    def with_corrected_camera(self, change: Array) -> PosePrior:
+        """Return the prior relative to a camera that is corrected by a change (4,)."""
+        return replace(self, g=self.g + self.H[:, :_OF_CAMERA] @ change)
 
     def with_frame(self, R: Array, t: Array) -> PosePrior:
         """Return the prior with one more pose, without information on it."""
@@ -137,7 +154,7 @@ class PosePrior:
     def without_frame(self, frame: int) -> PosePrior:
         """Return the prior with a frame marginalised out."""
         removed = np.zeros(len(self.H), bool)
-        removed[6 * frame:6 * frame + 6] = True
+        removed[_OF_CAMERA + 6 * frame:][:6] = True
         block, coupling = self.H[np.ix_(removed, removed)], self.H[np.ix_(~removed, removed)]
         # After a pure rotation, only the rotation of a frame may be constrained.
         block = block + np.diag(1e-9 * np.diag(block) + _WEAK)
@@ -154,7 +171,7 @@ class Landmarks:
 
     anchors: (N,) frames that created them; anchor_pixels: (N, 2) observed there, the centres of
     their patches; anchor_roots: (N, 2, 2) roots of the precision of these; points: (N, 2)
-    estimated pixels there, undistorted; rho: (N,) inverse depths there; slopes: (N, 2) relative
+    estimated pixels there; rho: (N,) inverse depths there; slopes: (N, 2) relative
     slopes of the inverse depth around them, per pixel; strengths: (N,) texture strengths of their
     patches; observation_counts: (N,) also by frames since removed; minima: (N, F, 2) pixels y*;
     roots: (N, F, 2, 2) of their precision, so that ``root (y - y*)`` is white; observed: (N, F)
@@ -178,16 +195,11 @@ class Landmarks:
 
     @classmethod
     def at(cls, anchor_pixels: Array, rho: Array, anchor: int, frames: int,
-           points: Array | None = None, slopes: Array | None = None,
-           strengths: Array | None = None) -> Landmarks:
-        """
-        Create landmarks without observations.
-
-        Without points there is no k1; without slopes the surfaces are fronto-parallel.
-        """
+           slopes: Array | None = None, strengths: Array | None = None) -> Landmarks:
+        """Create landmarks without observations; fronto-parallel ones without slopes."""
         n = len(rho)
         return cls(np.full(n, anchor, np.int64), anchor_pixels, np.zeros((n, 2, 2)),
-                   anchor_pixels if points is None else points, rho,
+                   anchor_pixels, rho,
                    np.zeros((n, 2)) if slopes is None else slopes,
                    np.ones(n) if strengths is None else strengths, np.zeros(n, np.int64),
                    np.zeros((n, frames, 2)), np.zeros((n, frames, 2, 2)),
@@ -220,24 +232,28 @@ class Landmarks:
         """Return the landmarks moved by a step (N, 3) of their inverse depths and points."""
         return replace(self, rho=self.rho + step[:, 0], points=self.points + step[:, 1:])
 
-    def with_corrected_images(self, K: Array, before: float, after: float) -> Landmarks:
+    def with_corrected_images(self, before: tuple[Array, float], after: tuple[Array, float]
+                              ) -> Landmarks:
         """
-        Convert observations in images corrected for one k1 to images corrected for another.
+        Convert observations in images corrected in one way to images corrected in another.
 
-        The points do not change: they are undistorted.
+        before, after: camera matrix (3, 3) and k1 by which they are undistorted. The viewing rays
+        of the points stay.
         """
         def moved(pixels: Array) -> tuple[Array, Array]:
             """Return pixels (N, 2) in the new image, and Jacobians of the old by the new ones."""
-            corrected = undistort(K, distort(K, pixels, before), after)
-            u = rays(K, corrected)[:, :2]
-            back = distortion_jacobian(K, rays(K, pixels)[:, :2], before)
-            by_new = np.linalg.solve(back, distortion_jacobian(K, u, after))
+            (K, k1), (new_K, new_k1) = before, after
+            corrected = undistort(new_K, distort(K, pixels, k1), new_k1)
+            back = distortion_jacobian(K, rays(K, pixels)[:, :2], k1)
+            by_new = np.linalg.solve(back, distortion_jacobian(
+                new_K, rays(new_K, corrected)[:, :2], new_k1))
             return corrected, np.asarray(by_new, float)
 
         anchor_pixels, by_anchor = moved(self.anchor_pixels)
         minima, by_minima = moved(self.minima.reshape(-1, 2))
         return replace(
             self, anchor_pixels=anchor_pixels, anchor_roots=self.anchor_roots @ by_anchor,
+            points=rays(before[0], self.points) @ after[0][:2].T,
             slopes=times(by_anchor.transpose(0, 2, 1), self.slopes),
             minima=minima.reshape(self.minima.shape),
             roots=self.roots @ by_minima.reshape(self.roots.shape))
@@ -258,10 +274,10 @@ def points_in_frame(K: Array, poses: Poses, landmarks: Landmarks, frame: int) ->
     return np.asarray(places + landmarks.rho[:, None] * t[frame, landmarks.anchors])
 
 
-def projected(K: Array, places: Array, k1: float = 0.0) -> Array:
+def projected(K: Array, places: Array) -> Array:
     """Project points (N, 3) in a camera to pixels (N, 2); those behind it are moved far out."""
     u = places[:, :2] / np.maximum(places[:, 2:], _MIN_DEPTH)
-    return np.clip((u * stretch(u, k1)) @ K[:2, :2].T + K[:2, 2], -_MAX_PIXEL, _MAX_PIXEL)
+    return np.clip(u @ K[:2, :2].T + K[:2, 2], -_MAX_PIXEL, _MAX_PIXEL)
 
 
 @dataclass(frozen=True)
@@ -283,7 +299,6 @@ class Observed:
     anchor_residuals: Array
     anchor_roots: Array
     K: Array
-    k1: float
     normalised: Array
     R: Array
     t: Array
@@ -301,9 +316,9 @@ def observe(K: Array, poses: Poses, landmarks: Landmarks) -> Observed:
             (landmark, frame), landmarks.anchors, poses.relative_motions,
             (landmarks.points, landmarks.rho, landmarks.minima, landmarks.roots,
              landmarks.anchor_roots, landmarks.anchor_pixels),
-            (K, inverse_intrinsics(K)), _tuning(poses.k1))
+            (K, inverse_intrinsics(K)), _LIMITS)
         return Observed(landmark, frame, anchor, residuals, anchor_residuals,
-                        landmarks.anchor_roots, K, poses.k1, normalised, *at_places)
+                        landmarks.anchor_roots, K, normalised, *at_places)
     anchor, rho = landmarks.anchors[landmark], landmarks.rho[landmark]
     R, t = (motions[frame, anchor] for motions in poses.relative_motions)
     rays_of_points = rays(K, landmarks.points)
@@ -312,15 +327,9 @@ def observe(K: Array, poses: Poses, landmarks: Landmarks) -> Observed:
     root = landmarks.roots[landmark, frame]
     return Observed(
         landmark, frame, anchor,
-        times(root, projected(K, place, poses.k1) - landmarks.minima[landmark, frame]),
-        times(landmarks.anchor_roots,
-              projected(K, rays_of_points, poses.k1) - landmarks.anchor_pixels),
-        landmarks.anchor_roots, K, poses.k1, rays_of_points[:, :2], R, t, ray, rho, place, root)
-
-
-def _tuning(k1: float) -> tuple[float, ...]:
-    """Return k1 and the limits of projections, as compiled code takes them."""
-    return k1, _MIN_DEPTH, FARTHEST, _MAX_PIXEL
+        times(root, projected(K, place) - landmarks.minima[landmark, frame]),
+        times(landmarks.anchor_roots, projected(K, rays_of_points) - landmarks.anchor_pixels),
+        landmarks.anchor_roots, K, rays_of_points[:, :2], R, t, ray, rho, place, root)
 
 
 @dataclass(frozen=True)
@@ -329,46 +338,30 @@ class Jacobians:
     Jacobians of the residuals of M observations and N points: see ``jacobians``.
 
     by_frame, by_anchor: (M, 2, 6) by the steps of the two poses; by_own: (M, 2, 3) by those of the
-    landmark's inverse depth and point; by_k1: (M, 2). Those of the points by their own steps (N,
-    2, 2), and by k1 (N, 2).
+    landmark's inverse depth and point; by_camera: (M, 2, 4) by the fields of a `Correction`. Those
+    of the points by their own steps (N, 2, 2), and by the camera (N, 2, 4).
     """
 
     by_frame: Array
     by_anchor: Array
     by_own: Array
-    by_k1: Array
+    by_camera: Array
     points_by_own: Array
-    points_by_k1: Array
+    points_by_camera: Array
 
 
-def _undistorted(observed: Observed) -> Array:
-    """Return the undistorted X/Z, Y/Z (M + N, 2) of observations and points."""
-    ahead = np.maximum(observed.place[:, 2:], _MIN_DEPTH)
-    return np.concatenate([observed.place[:, :2] / ahead, observed.normalised])
-
-
-def _by_undistorted(observed: Observed) -> tuple[Array, Array]:
-    """Return the Jacobians of residuals (M, 2, 2) and (N, 2, 2) by undistorted pixels."""
-    roots = np.concatenate([observed.root, observed.anchor_roots])
-    whitened = roots @ distortion_jacobian(observed.K, _undistorted(observed), observed.k1)
-    return whitened[:len(observed.root)], whitened[len(observed.root):]
-
-
-def _by_k1(observed: Observed) -> tuple[Array, Array]:
-    """Return the derivatives by k1 of the residuals of observations (M, 2) and points (N, 2)."""
-    u = _undistorted(observed)
-    moved = (u * (u * u).sum(1, keepdims=True)) @ observed.K[:2, :2].T
-    count = len(observed.root)
-    return times(observed.root, moved[:count]), times(observed.anchor_roots, moved[count:])
+def _by_camera(K: Array, u: Array, roots: Array) -> Array:
+    """Return the Jacobians (N, 2, 4) of residuals at X/Z, Y/Z (N, 2) by a `Correction`."""
+    return np.asarray(roots @ K[:2, :2] @ displacements(u))
 
 
 def jacobians(observed: Observed) -> Jacobians:
     """Return the analytic Jacobians of the residuals of observations and points."""
     K, R, place, ray = observed.K, observed.R, observed.place, observed.ray
-    root, points_by_own = _by_undistorted(observed)
-    scaled = root @ K[:2, :2] / np.maximum(place[:, 2], _MIN_DEPTH)[:, None, None]
+    depths = np.maximum(place[:, 2:], _MIN_DEPTH)
+    scaled = observed.root @ K[:2, :2] / depths[:, :, None]
     # Projection: d(x / z) = (dx - x / z dz) / z.
-    ahead = -times(scaled, place[:, :2]) / np.maximum(place[:, 2:], _MIN_DEPTH)
+    ahead = -times(scaled, place[:, :2]) / depths
     by_place = np.concatenate([scaled, ahead[:, :, None]], axis=2)
     by_ray = by_place @ R
     weight = observed.rho[:, None, None]
@@ -381,8 +374,9 @@ def jacobians(observed: Observed) -> Jacobians:
     by_own = np.empty((len(place), 2, 3))
     by_own[:, :, 0] = times(by_place, observed.t)
     np.matmul(by_ray, inverse_intrinsics(K)[:, :2], out=by_own[:, :, 1:])
-    by_k1, points_by_k1 = _by_k1(observed)
-    return Jacobians(by_frame, by_anchor, by_own, by_k1, points_by_own, points_by_k1)
+    return Jacobians(
+        by_frame, by_anchor, by_own, _by_camera(K, place[:, :2] / depths, observed.root),
+        observed.anchor_roots, _by_camera(K, observed.normalised, observed.anchor_roots))
 
 
 def _cross(a: Array, b: Array, out: Array) -> None:
@@ -414,56 +408,36 @@ def noise_scale(observed: Observed) -> float:
     return float(np.sqrt(median(squares[observed_once] / medians)))
 
 
-class K1Estimate(NamedTuple):
-    """Marginal information of k1, and its Newton step."""
+class CameraEquations(NamedTuple):
+    """Normal equations over the fields of a `Correction`: H (4, 4) and gradient g (4,)."""
 
-    curvature: float
-    step: float
+    H: Array
+    g: Array
 
 
 @dataclass(frozen=True)
 class Reduced:
-    """
-    Normal equations over the poses, H (6 F, 6 F) and gradient g (6 F,), landmarks eliminated.
+    """Normal equations over camera and poses, landmarks eliminated: H (4 + 6 F, 4 + 6 F), g."""
 
-    If k1 is a parameter, it comes before the poses in the Hessian. `change` back-substitutes the
-    landmarks.
-    """
-
-    _hessian: Array
-    _gradient: Array
+    H: Array
+    g: Array
     _coupling: Array
     _variances: Array
     _slopes: Array
-    _lens: bool
 
-    @property
-    def H(self) -> Array:
-        """Return the Hessian (6 F, 6 F) over the poses, given k1."""
-        return self._hessian[self._lens:, self._lens:]
-
-    @property
-    def g(self) -> Array:
-        """Return the gradient (6 F,) over the poses."""
-        return self._gradient[self._lens:]
-
-    def marginal_k1(self) -> K1Estimate:
-        """
-        Marginalise the poses too, without any prior on them, and return the information on k1.
-
-        k1 has to be among the parameters.
-        """
-        row, H = self._hessian[0, 1:], self.H
+    def of_camera(self) -> CameraEquations:
+        """Marginalise the poses too, without any prior on them."""
+        count = _OF_CAMERA
+        H, coupling = self.H[count:, count:], self.H[count:, :count]
         # Position and scale are gauge freedoms.
-        gain = np.linalg.solve(H + np.diag(_GAUGE * np.diag(H) + _WEAK), row)
-        curvature = float(self._hessian[0, 0] - gain @ row)
-        slope = float(self._gradient[0] - gain @ self.g)
-        return K1Estimate(curvature, -slope / curvature if curvature > 0 else 0.0)
+        gain = np.linalg.solve(H + np.diag(_GAUGE * np.diag(H) + _WEAK), coupling).T
+        reduced = self.H[:count, :count] - gain @ coupling
+        return CameraEquations((reduced + reduced.T) / 2, self.g[:count] - gain @ self.g[count:])
 
     def change(self, step: Array) -> Array:
-        """Return the steps (N, 3) of the landmarks for a step (6 F,) of the poses."""
+        """Return the steps (N, 3) of the landmarks for a step (4 + 6 F,) of camera and poses."""
         return np.asarray(-np.einsum('nij,nj->ni', self._variances,
-                                     self._slopes + self._coupling[:, :, self._lens:] @ step))
+                                     self._slopes + self._coupling @ step))
 
 
 def _by_poses(observed: Observed, by_frame: Array, by_anchor: Array, frames: int) -> Array:
@@ -474,40 +448,39 @@ def _by_poses(observed: Observed, by_frame: Array, by_anchor: Array, frames: int
     return by_poses.reshape(count, 2, 6 * frames)
 
 
-def eliminate(observed: Observed, weights: Array, weight: float, frames: int,
-              lens: bool = False) -> Reduced:
+def eliminate(observed: Observed, weights: Array, weight: float, frames: int) -> Reduced:
     """
     Sum the normal equations of observations, and eliminate the landmarks.
 
-    weights: (M,) of the observations; weight: of the residuals in the anchors; lens: whether k1 is
-    a parameter, or fixed.
+    weights: (M,) of the observations; weight: of the residuals in the anchors.
     """
     if compiled.library is not None:
         o = observed
         return Reduced(*compiled.eliminate(
             (o.landmark, o.frame, o.anchor),
             (o.residuals, o.R, o.t, o.ray, o.rho, o.place, o.root, weights),
-            (o.normalised, o.anchor_roots, o.anchor_residuals, weight), lens,
-            (o.K, inverse_intrinsics(o.K)), _tuning(o.k1), _DEPTH_INFORMATION, frames), lens)
+            (o.normalised, o.anchor_roots, o.anchor_residuals, weight),
+            (o.K, inverse_intrinsics(o.K)), _LIMITS, _DEPTH_INFORMATION, frames))
     n, linear = len(observed.anchor_residuals), jacobians(observed)
-    size = lens + 6 * frames
+    size = _OF_CAMERA + 6 * frames
     root = np.sqrt(weights)[:, None, None]
     by_frame, by_anchor = linear.by_frame * root, linear.by_anchor * root
     e, back = observed.residuals * root[:, 0], (linear.by_own * root).transpose(0, 2, 1)
-    by_k1 = linear.by_k1[:, :, None] * root
-    flat = np.concatenate([by_k1[:, :, :lens], _by_poses(observed, by_frame, by_anchor, frames)],
+    by_camera = linear.by_camera * root
+    flat = np.concatenate([by_camera, _by_poses(observed, by_frame, by_anchor, frames)],
                           axis=2).reshape(-1, size)
     H, g = flat.T @ flat, flat.T @ e.ravel()
-    points_by_own, points_by_k1 = linear.points_by_own, linear.points_by_k1
+    points_by_own, points_by_camera = linear.points_by_own, linear.points_by_camera
     information, slopes = np.tile(np.eye(3) * _DEPTH_INFORMATION, (n, 1, 1)), np.zeros((n, 3))
     transposed = points_by_own.transpose(0, 2, 1) * weight
     information[:, 1:, 1:] += transposed @ points_by_own
     slopes[:, 1:] = times(transposed, observed.anchor_residuals)
-    with_k1, coupling = np.zeros((n, 3, 1)), np.zeros((n, frames, 3, 6))
-    with_k1[:, 1:, 0] = times(transposed, points_by_k1)
-    if lens:
-        H[0, 0] += weight * (points_by_k1 * points_by_k1).sum()
-        g[0] += weight * (points_by_k1 * observed.anchor_residuals).sum()
+    with_camera, coupling = np.zeros((n, 3, _OF_CAMERA)), np.zeros((n, frames, 3, 6))
+    with_camera[:, 1:] = transposed @ points_by_camera
+    H[:_OF_CAMERA, :_OF_CAMERA] += weight * np.einsum(
+        'nia,nib->ab', points_by_camera, points_by_camera)
+    g[:_OF_CAMERA] += weight * np.einsum(
+        'nia,ni->a', points_by_camera, observed.anchor_residuals)
     # Each frame observes a landmark once, and each landmark has one anchor.
     coupling[observed.landmark, observed.frame] = back @ by_frame
     first = np.flatnonzero(np.diff(observed.landmark, prepend=-1))
@@ -515,10 +488,10 @@ def eliminate(observed: Observed, weights: Array, weight: float, frames: int,
     coupling[landmark, anchor] = np.add.reduceat(back @ by_anchor, first)
     information[landmark] += np.add.reduceat(back @ back.transpose(0, 2, 1), first)
     slopes[landmark] += np.add.reduceat((back @ e[:, :, None])[:, :, 0], first)
-    with_k1[landmark] += np.add.reduceat(back @ by_k1, first)
+    with_camera[landmark] += np.add.reduceat(back @ by_camera, first)
     coupled = np.concatenate(
-        [with_k1[:, :, :lens], coupling.transpose(0, 2, 1, 3).reshape(n, 3, 6 * frames)], axis=2)
+        [with_camera, coupling.transpose(0, 2, 1, 3).reshape(n, 3, 6 * frames)], axis=2)
     variances = np.asarray(np.linalg.inv(information), float)
     gain = (variances @ coupled).reshape(-1, size).T
     return Reduced(H - gain @ coupled.reshape(-1, size), g - gain @ slopes.ravel(),
-                   coupled, variances, slopes, lens)
+                   coupled, variances, slopes)

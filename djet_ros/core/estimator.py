@@ -16,6 +16,7 @@ from djet_ros.core.bodies import (
     of_followed_body,
 )
 from djet_ros.core.corners import detect_corners, detect_large_corners
+from djet_ros.core.correction import AS_CALIBRATED, Correction
 from djet_ros.core.covariance import is_within, pose_difference
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.features import detect_orb
@@ -74,11 +75,12 @@ class TwoViewEstimator:
 
     Stateless apart from its parameters: the same views and prior give the same result.
 
-    k1: first radial distortion coefficient that the images still have; `view` removes it.
+    correction: deviation of the camera from its calibration; views are without it.
     """
 
-    def __init__(self, config: EstimatorConfig | None = None, k1: float = 0.0) -> None:
-        self.config, self.k1 = config or EstimatorConfig(), k1
+    def __init__(self, config: EstimatorConfig | None = None,
+                 correction: Correction = AS_CALIBRATED) -> None:
+        self.config, self.correction = config or EstimatorConfig(), correction
         keep_freed_memory()
 
     def view(self, gray: NDArray[np.uint8], K: Array, features: Features | None = None,
@@ -90,10 +92,10 @@ class TwoViewEstimator:
         bool mask of pixels to ignore. Raises ValueError if the image or K has the wrong shape or
         type.
         """
-        K = np.asarray(K, np.float64)
-        require_gray(gray, K)
-        if self.k1:
-            gray, left_out = undistort_image(gray, K, self.k1, left_out)
+        require_gray(gray, np.asarray(K))
+        K = self.correction.camera_matrix(K)
+        if self.correction.k1:
+            gray, left_out = undistort_image(gray, K, self.correction.k1, left_out)
         mask = None if left_out is None else blocked(left_out)
         smoothed = smooth(gray)
         if features is None:
@@ -103,7 +105,9 @@ class TwoViewEstimator:
 
     def undistorted(self, gray: NDArray[np.uint8], K: Array) -> NDArray[np.uint8]:
         """Return an image (H, W) undistorted as in its views, to whose pixels results refer."""
-        return undistort_image(gray, K, self.k1)[0] if self.k1 else gray
+        correction = self.correction
+        return gray if not correction.k1 else undistort_image(
+            gray, correction.camera_matrix(K), correction.k1)[0]
 
     def features(self, gray: NDArray[np.uint8], mask: Mask | None = None) -> Features:
         """Detect all features of a gray image (H, W) uint8, except where a mask (H, W) is True."""

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from djet_ros.core.bundle import Landmarks, points_in_frame, Poses, projected
-from djet_ros.core.geometry import depths_in_second, inverse_depths, sphere_tangents
+from djet_ros.core.geometry import depths_in_second, inverse_depths, rays, sphere_tangents
 from djet_ros.core.paraboloid import median, weighted_median
-from djet_ros.core.radial import undistorted_rays
 from djet_ros.core.sketch import moved_all
 from djet_ros.core.types import Array, Pose, RelativePose
 import numpy as np
@@ -68,15 +67,14 @@ class Lengths(NamedTuple):
 @dataclass(frozen=True)
 class KnownDepths:
     """
-    Points of a frame: distorted pixels (P, 2), and inverse depths rho (P,) in the track's unit.
+    Points of a frame: pixels (P, 2), and inverse depths rho (P,) in the unit of the track.
 
-    K: (3, 3) and k1 of the lens.
+    K: (3, 3).
     """
 
     pixels: Array
     rho: Array
     K: Array
-    k1: float
 
     @classmethod
     def of_landmarks(cls, K: Array, poses: Poses, landmarks: Landmarks, frame: int) -> KnownDepths:
@@ -84,26 +82,24 @@ class KnownDepths:
         landmarks = landmarks.of(landmarks.rho > 0)
         points = points_in_frame(K, poses, landmarks, frame)
         ahead = points[:, 2] > 0
-        return cls(projected(K, points[ahead], poses.k1), landmarks.rho[ahead] / points[ahead, 2],
-                   K, poses.k1)
+        return cls(projected(K, points[ahead]), landmarks.rho[ahead] / points[ahead, 2], K)
 
     @classmethod
-    def of_pair(cls, K: Array, k1: float, pair: RelativePose, length: float) -> KnownDepths:
+    def of_pair(cls, K: Array, pair: RelativePose, length: float) -> KnownDepths:
         """Return the inliers of a pair of known length as points of its second frame."""
         y = pair.y_opt[pair.inliers]
-        rays_x = undistorted_rays(K, pair.x[pair.inliers], k1)
-        rho, _ = inverse_depths(pair.R, pair.t, rays_x, undistorted_rays(K, y, k1))
+        rays_x = rays(K, pair.x[pair.inliers])
+        rho, _ = inverse_depths(pair.R, pair.t, rays_x, rays(K, y))
         depths = depths_in_second(pair.R, pair.t, rays_x, rho)
         ahead = (rho > 0) & (depths > 0)
-        return cls(y[ahead], rho[ahead] / (depths[ahead] * length), K, k1)
+        return cls(y[ahead], rho[ahead] / (depths[ahead] * length), K)
 
     def rotated(self, R: Array) -> KnownDepths:
         """Return the points as they are seen after a rotation (3, 3) of the camera on the spot."""
-        rays = undistorted_rays(self.K, self.pixels, self.k1) @ R.T
-        ahead = rays[:, 2] > _LEAST_AHEAD
-        rays = rays[ahead]
-        return KnownDepths(projected(self.K, rays, self.k1), self.rho[ahead] / rays[:, 2], self.K,
-                           self.k1)
+        turned = rays(self.K, self.pixels) @ R.T
+        ahead = turned[:, 2] > _LEAST_AHEAD
+        turned = turned[ahead]
+        return KnownDepths(projected(self.K, turned), self.rho[ahead] / turned[:, 2], self.K)
 
     def lengths(self, pair: RelativePose, radius: float = _MATCH_RADIUS) -> Lengths:
         """
@@ -142,7 +138,7 @@ class KnownDepths:
                  ) -> tuple[Array, Array, Array]:
         """Return the inverse depths (M,) of points with a match in x, y (N, 2), and its rays."""
         near, match = same_points(self.pixels, x, radius)
-        rays_x, rays_y = (undistorted_rays(self.K, pixels[match], self.k1) for pixels in (x, y))
+        rays_x, rays_y = (rays(self.K, pixels[match]) for pixels in (x, y))
         return self.rho[near], rays_x, rays_y
 
 

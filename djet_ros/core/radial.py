@@ -71,15 +71,18 @@ class _Remap(NamedTuple):
 
 
 def undistort_image(gray: NDArray[np.uint8], K: Array, k1: float, left_out: Mask | None = None,
-                    before: float = 0.0) -> tuple[NDArray[np.uint8], Mask | None]:
+                    before: tuple[Array, float] | None = None
+                    ) -> tuple[NDArray[np.uint8], Mask | None]:
     """
     Undistort an image (H, W) by k1; also return the mask of pixels to leave out.
 
-    left_out: (H, W) bool, of the original image, or None; before: k1 that it is already corrected
-    for.
+    left_out: (H, W) bool, of the original image, or None; before: camera matrix and k1 by which it
+    is already undistorted.
     """
     height, width = gray.shape
-    remap = _remap(np.asarray(K, float).tobytes(), (height, width), k1, before)
+    K_before, k1_before = (K, 0.0) if before is None else before
+    remap = _remap(np.asarray(K, float).tobytes(), k1, np.asarray(K_before, float).tobytes(),
+                   k1_before, (height, width))
     # A black rim would be an edge that moves with the camera.
     straight = cv2.remap(gray, *remap.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     hidden = remap.unseen
@@ -90,10 +93,13 @@ def undistort_image(gray: NDArray[np.uint8], K: Array, k1: float, left_out: Mask
 
 
 @lru_cache(maxsize=4)
-def _remap(matrix: bytes, shape: tuple[int, int], k1: float, before: float) -> _Remap:
-    K, (height, width) = np.frombuffer(matrix).reshape(3, 3), shape
+def _remap(matrix: bytes, k1: float, matrix_before: bytes, k1_before: float,
+           shape: tuple[int, int]) -> _Remap:
+    height, width = shape
+    K, K_before = (np.frombuffer(one).reshape(3, 3) for one in (matrix, matrix_before))
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1, dtype=float)
-    x, y = undistort(K, distort(K, pixels.reshape(-1, 2), k1), before).T.reshape(2, height, width)
+    x, y = undistort(K_before, distort(K, pixels.reshape(-1, 2), k1), k1_before).T.reshape(
+        2, height, width)
     # The outermost pixels extend half a pixel beyond their centres.
     unseen = ((np.abs(x - (width - 1) / 2) > width / 2)
               | (np.abs(y - (height - 1) / 2) > height / 2))

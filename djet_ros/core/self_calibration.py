@@ -1,121 +1,148 @@
 """
-Online estimation of radial distortion that remains in the images, from windows of frames.
+Online estimation of what a calibration gets wrong, from windows of frames.
 
-A calibration, and rectification, may leave some radial distortion: points u = (X/Z, Y/Z) appear at
-u (1 + k1 |u|^2). On straight roads poses and depths absorb nearly all of it; in turns they do not,
-and uncorrected it makes lengths of steps drift.
+A calibration, and rectification, may be off by some radial distortion, focal length or principal
+point: see `core.correction`. On straight roads poses and depths absorb nearly all of it; in turns
+they do not, and uncorrected it makes lengths of steps drift, and turns directions of motion.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
+from djet_ros.core.correction import AS_CALIBRATED, Correction
 from djet_ros.core.geometry import rays
 from djet_ros.core.types import Array
 import numpy as np
+from scipy.special import logsumexp
 
-# chosen: prior standard deviation of the distortion, as relative displacement of the farthest
-# corner.
-_CORNER_DISPLACEMENT = 0.01
+# chosen: prior standard deviation of the distortion, as displacement of the farthest corner
+# relative to its distance from the principal point; and those of the focal length and of the
+# principal point, which a calibration determines better, as a share of the focal length.
+_CORNER_DISPLACEMENT, _SHARE = 0.01, 0.005
 
-# Pixels; chosen: standard deviation of a systematic error that looks like distortion in all
+# Pixels; chosen: standard deviation of a systematic error that looks like a parameter in all
 # windows.
 _SYSTEMATIC_ERROR = 0.01
 
-# chosen: no lens deviates by k1 alone, so each set of points prefers another k1: standard
-# deviation of that, relative to the prior one.
-_MODEL_ERROR = 0.3
+# chosen: no camera deviates by these parameters alone, so each set of points prefers others:
+# standard deviation of that, relative to the prior one.
+_MODEL_ERROR = 0.2
 
-# Standard errors; more than usual, since the test is repeated over and over.
-_SIGNIFICANT = 4.0
+# Number of parameters, and which of them may be right: none of them, at last all.
+_COUNT = len(Correction._fields)
+_SUBSETS = np.array(list(np.ndindex(*[2] * _COUNT)), bool)
 
-# chosen: prior odds that there is no distortion.
-_PRIOR_ODDS = 20.0
+# chosen: prior odds that a parameter is right, and probability below which it is beyond doubt that
+# not all are.
+_PRIOR_ODDS, _DOUBT = 5.0, 0.01
+
+# Least share of the largest sensitivity: directions below are not measured.
+_LEAST_SENSITIVITY = 1e-9
 
 
 @dataclass(frozen=True)
 class SelfCalibration:
     """
-    Estimate of k1.
+    Estimate of a camera's deviation from its calibration.
 
-    mean, covariance: (2,) and (2, 2) of k1, if there is any, and of the systematic error that
-    looks like it, in pixels; prior_sigma: prior standard deviation of k1; corrected_k1: k1 that
-    images are already corrected for, and corrected_sigma: its standard deviation when that was
-    chosen.
+    mean, covariance: (8,) and (8, 8) of the fields of a `Correction`, if the calibration is wrong,
+    relative to prior_sigmas (4,), and of systematic errors in pixels that look like them; focal:
+    calibrated focal lengths in pixels (2,); corrected: what images are already corrected for.
     """
 
     mean: Array
     covariance: Array
-    prior_sigma: float
-    corrected_k1: float = 0.0
-    corrected_sigma: float = np.inf
+    prior_sigmas: Array
+    focal: Array
+    corrected: Correction = AS_CALIBRATED
 
     @classmethod
     def unknown(cls, K: Array, shape: tuple[int, ...]) -> SelfCalibration:
         """Return the prior for a camera matrix (3, 3) and the shape (H, W) of its images."""
         height, width = shape
         corners = rays(K, np.array([[0, 0], [width, 0], [0, height], [width, height]]))[:, :2]
-        prior_sigma = _CORNER_DISPLACEMENT / float((corners**2).sum(1).max())
-        return cls(np.zeros(2), np.diag([prior_sigma, _SYSTEMATIC_ERROR])**2, prior_sigma)
+        farthest = float(np.linalg.norm(corners, axis=1).max())
+        prior = np.repeat([1.0, _SYSTEMATIC_ERROR], _COUNT)**2
+        return cls(np.zeros(2 * _COUNT), np.diag(prior),
+                   np.array([_CORNER_DISPLACEMENT / farthest**2, _SHARE, _SHARE, _SHARE]),
+                   np.diag(K)[:2])
 
     @property
-    def sigma(self) -> float:
-        """Return the standard deviation of k1, if there is any distortion."""
-        return float(np.sqrt(self.covariance[0, 0]))
+    def deviation(self) -> Correction:
+        """Return the deviation, if there is any."""
+        return Correction(*(self.mean[:_COUNT] * self.prior_sigmas).tolist())
+
+    @property
+    def sigmas(self) -> Correction:
+        """Return its standard deviations."""
+        return Correction(
+            *(np.sqrt(np.diag(self.covariance)[:_COUNT]) * self.prior_sigmas).tolist())
+
+    @cached_property
+    def _right(self) -> float:
+        """
+        Return the probability that the calibration is right.
+
+        Each parameter may be right by itself: few of them may explain what all windows have shown.
+        The odds that some are right grow by the ratio of posterior to prior density where they are
+        zero (Dickey, Annals of Mathematical Statistics 1971).
+        """
+        mean, covariance = self.mean[:_COUNT], self.covariance[:_COUNT, :_COUNT]
+        logs = []
+        for right in _SUBSETS:
+            block = covariance[np.ix_(right, right)]
+            logs.append(right.sum() * np.log(_PRIOR_ODDS) - np.linalg.slogdet(block)[1] / 2
+                        - mean[right] @ np.linalg.solve(block, mean[right]) / 2)
+        return float(np.exp(logs[-1] - logsumexp(logs)))
 
     @property
     def significant(self) -> bool:
-        """Return whether the distortion is significant."""
-        return abs(float(self.mean[0])) > _SIGNIFICANT * self.sigma
-
-    @property
-    def k1(self) -> float:
-        """
-        Return the expected coefficient: next to zero until it is significant.
-
-        The odds of no distortion grow by the ratio of posterior to prior density at zero (Dickey,
-        Annals of Mathematical Statistics 1971). A k1 that fluctuates costs more than one that is
-        never estimated: with each change the lengths of steps change.
-        """
-        z = float(self.mean[0]) / self.sigma
-        none = _PRIOR_ODDS * self.prior_sigma / self.sigma * np.exp(-z**2 / 2)
-        return float(self.mean[0] / (1 + none))
-
-    @property
-    def residual_k1(self) -> float:
-        """Return the expected k1 that remains in images as they are corrected now."""
-        return self.k1 - self.corrected_k1
+        """Return whether the calibration is wrong beyond doubt."""
+        return self._right < _DOUBT
 
     @property
     def needs_update(self) -> bool:
         """
-        Return whether images should be corrected with a new k1.
+        Return whether images should be corrected anew.
 
-        First when it becomes significant, then each time its variance has halved: a few times in
-        all, and never back and forth, as the variance never grows.
+        If the deviation is significant, and differs from what is corrected by more than the
+        uncertainty, a standard deviation for each parameter. That is so when it becomes
+        significant, and about each time that its variance has halved: a few times in all. With
+        each correction the lengths of steps change, so one that fluctuates would cost more than
+        one that is never made.
         """
-        if np.isinf(self.corrected_sigma):
-            return self.significant
-        return 2 * self.sigma**2 < self.corrected_sigma**2
+        if not self.significant:
+            return False
+        change = np.subtract(self.deviation, self.corrected) / self.prior_sigmas
+        return bool(change @ np.linalg.solve(self.covariance[:_COUNT, :_COUNT], change) > _COUNT)
 
-    def corrected(self) -> SelfCalibration:
-        """Return the same after images have been corrected for the expected k1."""
-        return replace(self, corrected_k1=self.k1, corrected_sigma=self.sigma)
+    def after_correction(self) -> SelfCalibration:
+        """Return the same after images have been corrected for the deviation."""
+        return replace(self, corrected=self.deviation)
 
-    def update(self, k1: float, variance: float, sensitivity: float) -> SelfCalibration:
+    def update(self, sensitivity: Array, gradient: Array, noise: float) -> SelfCalibration:
         """
         Update the estimate with the result of one window, by a Kalman filter.
 
-        k1: best for the window in images as they are corrected, variance: from the noise of its
-        observations; sensitivity: root mean square, in pixels, of the residuals that a k1 of one
-        leaves after poses and depths have adapted. Where it is small, as on a straight road, a
-        small systematic error has the same effect as a large k1; comparing with turns, where it is
-        not, separates the two.
+        sensitivity: (4, 4) mean square, in pixels, of the residuals that a deviation leaves after
+        poses and depths have adapted, as a quadratic form; gradient: (4,) half the derivative of
+        the mean square residual in images as they are corrected; noise: variance, in pixels^2, of
+        the mean residual along any axis of the sensitivity. Where the sensitivity is small, as on
+        a straight road, a small systematic error has the same effect as a large deviation;
+        comparing with turns, where it is not, separates the two.
         """
-        row = np.array([1.0, 1 / sensitivity])
-        noise = variance + (_MODEL_ERROR * self.prior_sigma)**2
-        gain = self.covariance @ row / (row @ self.covariance @ row + noise)
-        covariance = self.covariance - np.outer(gain, row @ self.covariance)
-        innovation = self.corrected_k1 + k1 - row @ self.mean
-        return replace(self, mean=self.mean + gain * innovation,
+        scale = self.prior_sigmas
+        squares, axes = np.linalg.eigh(scale[:, None] * sensitivity * scale)
+        measured = squares > _LEAST_SENSITIVITY * squares[-1]
+        by_axis = np.sqrt(squares[measured])[:, None] * axes[:, measured].T
+        rows = np.concatenate([by_axis, axes[:, measured].T], axis=1)
+        seen = (by_axis @ (np.array(self.corrected) / scale)
+                - by_axis @ (scale * gradient) / squares[measured])
+        spread = rows @ self.covariance @ rows.T + noise * np.eye(len(rows)) + (
+            _MODEL_ERROR**2 * by_axis @ by_axis.T)
+        gain = np.linalg.solve(spread, rows @ self.covariance).T
+        covariance = self.covariance - gain @ rows @ self.covariance
+        return replace(self, mean=self.mean + gain @ (seen - rows @ self.mean),
                        covariance=(covariance + covariance.T) / 2)

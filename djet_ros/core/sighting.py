@@ -85,7 +85,7 @@ class Sighting:
         """
         landmarks, newest = self.landmarks, len(self.views) - 1
         places = points_in_frame(self.K, self.poses, landmarks, newest)
-        expected = projected(self.K, places, self.poses.k1)
+        expected = projected(self.K, places)
         view = self.views[newest]
         visible = (places[:, 2] > 0) & ~masked_at(view.mask, expected)
         visible &= self.distances.describable(expected, view.surface_gray.shape, reach)

@@ -30,21 +30,23 @@ from djet_ros.core.bundle import (
     projected,
     Reduced,
 )
+from djet_ros.core.correction import motion_shift
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import (
     inverse_depths,
     norms,
+    rays,
     rotation_exp,
     rotation_log,
     skew,
     sphere_tangents,
     unit,
 )
-from djet_ros.core.jet import Loss, robust_scale
+from djet_ros.core.jet import LEAST_CURVATURE, Loss, robust_scale
 from djet_ros.core.known_depths import KnownDepths, Lengths
 from djet_ros.core.landmark_choice import choose_landmarks
 from djet_ros.core.paraboloid import median
-from djet_ros.core.radial import undistort, undistort_image, undistorted_rays
+from djet_ros.core.radial import undistort_image
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.sighting import Sighting
 from djet_ros.core.slants import slopes
@@ -103,6 +105,8 @@ class WindowTuning:
     # chosen: share of the previous frame's refinement that a step corrects. With all of it the
     # track would jump; with none it would drift twice as much over a hundred frames
     correction_share: float = 0.2
+    # chosen: most drift of the logarithm of lengths that a correction of the camera takes back
+    most_drift: float = 0.5
 
 
 WINDOW_TUNING = WindowTuning()
@@ -157,25 +161,25 @@ class Window:
     The unit is the length of the first pair that is added. Holds at most `keyframes` + 1 images.
 
     final_landmarks: (M, 3) landmarks, in the newest frame, that were refined for the last time;
-    lens: estimate of the distortion of the images.
+    calibration: estimate of what that of the camera gets wrong.
     """
 
     def __init__(self, config: EstimatorConfig, tuning: WindowTuning = WINDOW_TUNING) -> None:
         self._config, self._tuning = config, tuning
         self._distances = DescriptorDistances(config)
 
-    def start(self, view: View, lens: SelfCalibration | None = None,
+    def start(self, view: View, calibration: SelfCalibration | None = None,
               turn: Array | None = None) -> None:
         """
-        Reset everything but the estimate of the lens; this frame is the first.
+        Reset everything but the estimate of the camera; this frame is the first.
 
         turn: rotation (3, 3) from the newest frame before, if both were taken at about the same
         place: depths around its landmarks then give the length of the next pair.
         """
         self._scene = None if turn is None else self._scene_after(turn)
         self._K, self._views = view.K, [view]
-        self.lens = lens or SelfCalibration.unknown(view.K, view.gray.shape)
-        self._poses = Poses(np.eye(3)[None], np.zeros((1, 3)), self.lens.residual_k1)
+        self.calibration = calibration or SelfCalibration.unknown(view.K, view.gray.shape)
+        self._poses = Poses(np.eye(3)[None], np.zeros((1, 3)))
         self._is_keyframe, self._has_landmarks = [True], [False]
         # Whether the newest frame would be a keyframe, but has no parallax; and whether the one
         # before it has just become one.
@@ -183,6 +187,8 @@ class Window:
         self._landmarks = Landmarks.at(np.empty((0, 2)), np.empty(0), 0, 1)
         self._prior = PosePrior.holding(self._poses)
         self._scale = 1.0
+        # Derivatives of the logarithm of the newest length by what may be wrong with the camera.
+        self._length_by_camera = np.zeros(4)
         # The newest camera as it was published, in the frame of the oldest keyframe; its pose may
         # have been refined since.
         self._published = np.eye(4)
@@ -258,7 +264,7 @@ class Window:
             self._marginalise_landmarks(observed[:, -2] & ~observed[:, -1])
             self._marginalise_frame(len(self._views) - 2)
         if sum(self._is_keyframe) > self._tuning.keyframes:
-            self._update_lens()
+            self._update_calibration()
             self._marginalise_landmarks(self._landmarks.anchors == 0)
             self._marginalise_frame(0)
         # Without parallax new keyframes would only drop landmarks.
@@ -272,29 +278,56 @@ class Window:
         """Record the motion (4, 4) published for the newest step, in the unit of the track."""
         self._published = self._published @ motion
 
-    def correct_images(self, newest: View) -> None:
+    def correct_images(self, newest: View) -> float:
         """
-        Continue with images corrected for the expected k1, of which newest is the first.
+        Continue with images of the camera as it is expected to be, of which newest is the first.
 
-        Earlier observations are moved to where the corrected images would show them.
+        Poses and landmarks become those that the corrected images would have given, from the start
+        of the track on, and observations are moved to where these would show them. Returns the
+        ratio of the length of the newest step to what it was.
         """
-        before, self.lens = self.lens.corrected_k1, self.lens.corrected()
+        length = self._newest_length
+        before = self._K, self.calibration.corrected.k1
+        corrected = self.calibration.after_correction()
+        self._adapt_to(np.subtract(corrected.corrected, self.calibration.corrected))
+        self._K, self.calibration = newest.K, corrected
+        after = self._K, self.calibration.corrected.k1
         self._views = [*(self._corrected(view, before) for view in self._views[:-1]), newest]
-        moved = self._landmarks.with_corrected_images(self._K, before, self.lens.corrected_k1)
+        moved = self._landmarks.with_corrected_images(before, after)
         # Patches that leave the image are dropped.
         inside = self._distances.describable(moved.anchor_pixels, newest.surface_gray.shape)
         self._landmarks = moved.of(inside)
-        self._poses = replace(self._poses, k1=self.lens.residual_k1)
         self._latest = None
+        return self._newest_length / length if length > 0 else 1.0
 
-    def _corrected(self, view: View, before: float) -> View:
+    @property
+    def _newest_length(self) -> float:
+        return float(np.linalg.norm(self._poses.relative_motions[1][-1, -2]))
+
+    def _adapt_to(self, change: Array) -> None:
+        """Move poses and landmarks by what a change (4,) of the camera makes of them."""
+        published = np.linalg.inv(self._poses.camera(-1)) @ self._published
+        reduced = self._reduced(self._observed())
+        _, by_camera = self._poses_of_camera(reduced)
+        # To first order, so long lengths must not become negative.
+        drift = abs(float(self._newest_by_camera(by_camera) @ change))
+        change = change * min(self._tuning.most_drift / max(drift, 1e-9), 1.0)
+        step = by_camera @ change
+        self._landmarks = self._landmarks.moved(reduced.change(np.concatenate([change, step])))
+        self._poses = self._poses.moved(step)
+        self._prior = self._prior.with_corrected_camera(change)
+        # What is published already stays; the path goes on from there.
+        self._published = self._poses.camera(-1) @ published
+
+    def _corrected(self, view: View, before: tuple[Array, float]) -> View:
         """
-        Correct a view for the expected k1 where it was corrected for another before.
+        Correct a view that was undistorted with another camera matrix and k1 before.
 
         Only its images that are still needed: landmarks are not created in it again.
         """
-        gray, _ = undistort_image(view.gray, self._K, self.lens.corrected_k1, before=before)
-        return replace(view, gray=gray, surface_gray=self._distances.smoothed(gray))
+        gray, _ = undistort_image(view.gray, self._K, self.calibration.corrected.k1,
+                                  before=before)
+        return replace(view, gray=gray, K=self._K, surface_gray=self._distances.smoothed(gray))
 
     def landmarks(self) -> Array:
         """Return the reliable landmarks as points (M, 3) in the newest frame."""
@@ -306,14 +339,6 @@ class Window:
             chosen & (self._landmarks.observed.sum(1) > 1) & (self._landmarks.rho > 0)))
         places = points_in_frame(self._K, self._poses, reliable, len(self._views) - 1)
         return np.asarray(places / reliable.rho[:, None])
-
-    def _projected(self, places: Array) -> Array:
-        """Project points (N, 3) in a camera to distorted pixels (N, 2)."""
-        return projected(self._K, places, self._poses.k1)
-
-    def _rays(self, pixels: Array) -> Array:
-        """Return the viewing rays (N, 3), with z = 1, of distorted pixels (N, 2)."""
-        return undistorted_rays(self._K, pixels, self._poses.k1)
 
     def _length(self, view: View, relative: RelativePose, guess: float
                 ) -> tuple[float, _Measured]:
@@ -353,7 +378,7 @@ class Window:
         """Return the length by points of known depth; None for few of them."""
         lengths = self._lengths_by_landmarks(relative)
         if len(lengths.values) < self._tuning.min_landmarks and self._latest is not None:
-            lengths = KnownDepths.of_pair(self._K, self._poses.k1, *self._latest).lengths(relative)
+            lengths = KnownDepths.of_pair(self._K, *self._latest).lengths(relative)
         if len(lengths.values) < self._tuning.min_landmarks:
             return self._measured_around(self._known_depths(), relative)
         return self._median(lengths, self._tuning.length_sigma)
@@ -362,7 +387,7 @@ class Window:
         """Return the depths around the newest frame as seen after a rotation (3, 3) of it."""
         scene = self._scene if self.is_new else self._known_depths()
         if (scene is None or len(scene.rho) < self._tuning.min_landmarks) and self._latest:
-            scene = KnownDepths.of_pair(self._K, self._poses.k1, *self._latest)
+            scene = KnownDepths.of_pair(self._K, *self._latest)
         return None if scene is None else scene.rotated(turn)
 
     def first_length(self, relative: RelativePose) -> tuple[float, float] | None:
@@ -446,7 +471,7 @@ class Window:
         if len(visible) < (1 - self._tuning.lost) * self._tuning.landmarks:
             return True
         R = self._poses.R[newest] @ self._poses.R[last].T
-        rotated, moved = (self._projected(places) for places in (
+        rotated, moved = (projected(self._K, places) for places in (
             points_in_frame(self._K, self._poses, visible, last) @ R.T,
             points_in_frame(self._K, self._poses, visible, newest)))
         return bool(median(norms(moved - rotated)) > self._tuning.parallax)
@@ -475,16 +500,22 @@ class Window:
         J[:3, :3], J[3:, 3:6] = -R, -R
         J[:3, 6:9], J[3:, 6:9], J[3:, 9:] = np.eye(3), -skew(t), np.eye(3)
         if relative.t.any():
-            J_pair = np.concatenate([J[:3], sphere_tangents(relative.t).T @ J[3:] / length])
-            along = relative.t @ J[3:] / expected.sigma
+            J_pair = np.concatenate([-motion_shift(relative, self._K), np.concatenate(
+                [J[:3], sphere_tangents(relative.t).T @ J[3:] / length])], axis=1)
+            # The expected length is that of earlier steps, and depends on the camera as they do.
+            along = np.concatenate([-length * self._length_by_camera,
+                                    relative.t @ J[3:]]) / expected.sigma
             information = (J_pair.T @ np.linalg.inv(relative.covariance_5) @ J_pair
                            + np.outer(along, along))
             gradient = along * (length - expected.length) / expected.sigma
         else:
-            information = J[:3].T @ J[:3] * _ROTATION_INFORMATION
-            gradient = np.zeros(12)
+            by_poses = np.concatenate([np.zeros((3, 4)), J[:3]], axis=1)
+            information = by_poses.T @ by_poses * _ROTATION_INFORMATION
+            gradient = np.zeros(16)
         H, g = np.zeros_like(self._prior.H), np.zeros_like(self._prior.g)
-        H[-12:, -12:], g[-12:] = information, gradient
+        # The camera comes first, the newest two frames last.
+        places = np.r_[:4, len(g) - 12:len(g)]
+        H[np.ix_(places, places)], g[places] = information, gradient
         self._prior.add(H, g, self._poses)
 
     def has_depths(self, relative: RelativePose) -> bool:
@@ -504,7 +535,7 @@ class Window:
     def _triangulated(self, relative: RelativePose) -> tuple[Array, Array, Array]:
         """Return pixels (M, 2) of a pair's inliers, their inverse depths and their deviations."""
         x, y = relative.x[relative.inliers], relative.y_opt[relative.inliers]
-        return x, *inverse_depths(relative.R, relative.t, self._rays(x), self._rays(y))
+        return x, *inverse_depths(relative.R, relative.t, rays(self._K, x), rays(self._K, y))
 
     def _create_landmarks(self, relative: RelativePose, length: float) -> None:
         """Create landmarks from a keyframe and the frame after it, unless depths are noise."""
@@ -518,13 +549,12 @@ class Window:
         usable = (rho > 0) & self._distances.describable(x, self._views[anchor].surface_gray.shape)
         x, rho = x[usable], rho[usable]
         visible = self._landmarks.of(self._landmarks.observed[:, anchor])
-        present = self._projected(points_in_frame(self._K, self._poses, visible, anchor))
+        present = projected(self._K, points_in_frame(self._K, self._poses, visible, anchor))
         side = tuning.cell * np.sqrt(self._views[anchor].surface_gray.size / tuning.landmarks)
         chosen = choose_landmarks(x, rho, present, side, tuning.landmarks - len(visible))
         x, rho = x[chosen], rho[chosen]
         self._landmarks = self._landmarks.joined(Landmarks.at(
-            x, rho / length, anchor, len(self._views),
-            undistort(self._K, x, self._poses.k1), slopes(*surfaces, x),
+            x, rho / length, anchor, len(self._views), slopes(*surfaces, x),
             self._distances.strengths(self._views[anchor].surface_gray,
                                       np.rint(x).astype(np.int64))))
 
@@ -544,18 +574,37 @@ class Window:
         observed, prior = self._observed(), self._prior.at(self._poses)
         for _ in range(self._tuning.steps):
             reduced = self._reduced(observed)
-            H, g = self._prior.H + reduced.H, prior.gradient + reduced.g
-            step = np.asarray(-np.linalg.solve(H + np.diag(1e-9 * np.diag(H)), g), float)
-            observed, prior = self._line_search(observed, prior, step, reduced.change(step))
+            H, by_camera = self._poses_of_camera(reduced)
+            step = -_solved(H, prior.gradient + reduced.g[4:])
+            observed, prior = self._line_search(observed, prior, step, reduced.change(
+                np.concatenate([np.zeros(4), step])))
+        self._length_by_camera = self._newest_by_camera(by_camera)
         outliers = norms(observed.residuals) > self._tuning.outlier * self._scale
         self._landmarks.observed[observed.landmark[outliers], observed.frame[outliers]] = False
         np.subtract.at(self._landmarks.observation_counts, observed.landmark[outliers], 1)
         # Relative to the newest step: the unit may be much longer or shorter.
-        length = float(np.linalg.norm(self._poses.relative_motions[1][-1, -2]))
-        in_front = self._landmarks.rho * length > -self._tuning.negative_parallax
+        in_front = self._landmarks.rho * self._newest_length > -self._tuning.negative_parallax
         self._landmarks = self._landmarks.of(
             np.asarray(self._landmarks.observed.any(1) & in_front))
         return H
+
+    def _poses_of_camera(self, reduced: Reduced) -> tuple[Array, Array]:
+        """Return the Hessian (6 F, 6 F) over the poses, and how they depend on the camera."""
+        whole = self._prior.H + reduced.H
+        return whole[4:, 4:], -_solved(whole[4:, 4:], whole[4:, :4])
+
+    def _newest_by_camera(self, by_camera: Array) -> Array:
+        """
+        Return how the logarithm of the newest length depends on the camera, (4,).
+
+        by_camera: (6 F, 4) of the poses. Without a length it is that of the step before.
+        """
+        R, t = (motions[-1, -2] for motions in self._poses.relative_motions)
+        squared = float(t @ t)
+        if not squared:
+            return self._length_by_camera
+        by_poses = np.concatenate([-t @ R, t]) / squared
+        return np.asarray(by_poses @ by_camera[[-9, -8, -7, -3, -2, -1]])
 
     def _line_search(self, observed: Observed, prior: PriorCost, step: Array, change: Array
                      ) -> tuple[Observed, PriorCost]:
@@ -578,8 +627,10 @@ class Window:
 
     def _robust_losses(self, observed: Observed, scale: float) -> tuple[Array, Array]:
         """Return the losses (M,) of observations with a noise `scale`, and their weights."""
-        loss = Loss('geman_mcclure', self._tuning.loss_scale * scale)
-        return loss((observed.residuals**2).sum(1))
+        return self._loss(scale)((observed.residuals**2).sum(1))
+
+    def _loss(self, scale: float) -> Loss:
+        return Loss('geman_mcclure', self._tuning.loss_scale * scale)
 
     def _normalise_roots(self) -> None:
         """Scale the roots of precision in the newest frame to a median of one pixel."""
@@ -599,11 +650,11 @@ class Window:
             self._scale = max(noise_scale(observed), self._tuning.least_scale)
         return observed
 
-    def _reduced(self, observed: Observed, lens: bool = False) -> Reduced:
-        """Weight observations robustly and eliminate landmarks; lens: with k1 as a parameter."""
+    def _reduced(self, observed: Observed) -> Reduced:
+        """Weight observations robustly and eliminate landmarks."""
         _, weights = self._robust_losses(observed, self._scale)
         weight = self._scale**-2
-        return eliminate(observed, weights * weight, weight, len(self._views), lens)
+        return eliminate(observed, weights * weight, weight, len(self._views))
 
     def _newest_motion(self, H: Array) -> WindowStep:
         """Return the newest motion, and the uncertainty of its length."""
@@ -636,21 +687,27 @@ class Window:
         correction[:3, 3] = share * refined[:3, 3]
         return np.asarray(correction @ np.linalg.inv(before) @ newest)
 
-    def _update_lens(self) -> None:
+    def _update_calibration(self) -> None:
         """
-        Update the estimate of k1 by the window, before its oldest keyframe is marginalised.
+        Update the estimate of the camera, before the oldest keyframe is marginalised.
 
         Each landmark is in as many windows as there are keyframes, so each window's information is
-        divided by that number. The prior of marginalised frames keeps the k1 of its time.
+        divided by that number. A robust loss curves less than its weights say (Huber, Robust
+        Statistics, section 7.6), for residuals of two numbers by half as much on average: a step
+        by the weights would be too short.
         """
         observed = observe(self._K, self._poses, self._landmarks)
-        k1 = self._reduced(observed, lens=True).marginal_k1()
-        _, weights = self._robust_losses(observed, self._scale)
-        if k1.curvature > 0:
-            self.lens = self.lens.update(
-                self._poses.k1 + k1.step, self._tuning.keyframes / k1.curvature,
-                self._scale * np.sqrt(k1.curvature / weights.sum()))
-            self._poses = replace(self._poses, k1=self.lens.residual_k1)
+        if not len(observed.residuals):
+            return
+        H, g = self._reduced(observed).of_camera()
+        loss, squared = self._loss(self._scale), (observed.residuals**2).sum(1)
+        _, weights = loss(squared)
+        flattened = max(float((1 + loss.curvature(squared).sum() / weights.sum()) / 2),
+                        LEAST_CURVATURE)
+        # Per observation, and in pixels.
+        share = self._scale**2 / weights.sum()
+        self.calibration = self.calibration.update(
+            share * H, share / flattened * g, self._tuning.keyframes * share / flattened**2)
 
     def _marginalise_landmarks(self, chosen: NDArray[np.bool_]) -> None:
         """Marginalise the chosen landmarks (N,) into the prior, before a frame is removed."""
@@ -671,3 +728,8 @@ class Window:
             self._views, self._is_keyframe, self._has_landmarks)
         for per_frame in lists:
             del per_frame[frame]
+
+
+def _solved(H: Array, right: Array) -> Array:
+    """Solve equations over poses, whose position and scale next to nothing may determine."""
+    return np.asarray(np.linalg.solve(H + np.diag(1e-9 * np.diag(H)), right), float)

@@ -234,14 +234,23 @@ def frame_mismatch(info_frame: str, image_frame: str) -> Complaint | None:
         'give both one frame_id'))
 
 
-def residual_distortion(lens: SelfCalibration | None) -> Complaint | None:
-    """Return the problem of a significant distortion that the calibration does not have."""
-    if lens is None:
+def calibration_off(found: SelfCalibration | None) -> Complaint | None:
+    """Return the problem that landmarks show a deviation of the camera from its calibration."""
+    if found is None:
         return None
-    return Complaint('distortion left', 'WARN', (
-        f'landmarks show a residual distortion of k1 = {lens.k1:.4f} +- {lens.sigma:.4f}; it is '
-        'removed from the images from now on, but not from earlier ones: djet lens estimates it '
-        'from the whole recording, and says how to correct the calibration'))
+    return Complaint('calibration off', 'WARN', (
+        f'landmarks show that the calibration is off by {deviation_text(found)}; this is '
+        'corrected from now on, but was not in earlier images: calibrate anew'))
+
+
+def deviation_text(found: SelfCalibration) -> str:
+    """Return the deviation of a camera from its calibration, with standard deviations."""
+    value, sigma = found.deviation, found.sigmas
+    cx, cy = ((shift * focal, off * focal) for shift, off, focal in
+              zip(value[2:], sigma[2:], found.focal))
+    return (f'k1 = {value.k1:.4f} +- {sigma.k1:.4f}, focal length {100 * value.focal:.2f} +- '
+            f'{100 * sigma.focal:.2f} %, principal point {cx[0]:.1f} +- {cx[1]:.1f} and '
+            f'{cy[0]:.1f} +- {cy[1]:.1f} px')
 
 
 def _equal_stamps(images: int, stamp_ns: int) -> Complaint | None:

@@ -10,11 +10,12 @@ both.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 from djet_ros.config.sections import NODE_NAME, OdometryConfig
+from djet_ros.core.correction import AS_CALIBRATED, Correction
 from djet_ros.core.types import Array, STARTED, Status, TRACKED
 from djet_ros.errors import DjetError
 from djet_ros.odometry.mounting import pose_of_base, twist_of_base
@@ -249,12 +250,21 @@ class MessageFactory:
         return self._type('geometry_msgs/msg/Vector3')(x=x, y=y, z=z)
 
 
-def k1_of(word: str | None) -> float:
-    """Return a radial distortion from text, zero if missing; raises ValueError if not finite."""
-    k1 = float(word or 0.0)
-    if not np.isfinite(k1):
-        raise ValueError(f'k1 is {word}')
-    return k1
+def correction_values(correction: Correction) -> dict[str, str]:
+    """Return a correction as exact texts, keyed by its fields."""
+    return {name: repr(float(value)) for name, value in correction._asdict().items()}
+
+
+def correction_of(values: Mapping[str, str | None]) -> Correction:
+    """
+    Return the correction in ``correction_values`` among other values; what is missing is zero.
+
+    Raises ValueError if it is not finite, or leaves no focal length.
+    """
+    correction = Correction(*(float(values.get(name) or 0.0) for name in Correction._fields))
+    if not np.isfinite(correction).all() or correction.focal <= -1:
+        raise ValueError(f'the correction of the camera is {tuple(correction)}')
+    return correction
 
 
 class FrameStatus(NamedTuple):
@@ -263,8 +273,8 @@ class FrameStatus(NamedTuple):
 
     reference_ns: stamp of the reference frame, or None; scale: unit of the translation's length;
     stationary: whether the camera stood still, so that the reference frame stays; keyframe:
-    whether it is a keyframe of the odometry, None if that has none or does not say; k1: radial
-    distortion that was removed from its image.
+    whether it is a keyframe of the odometry, None if that has none or does not say;
+    camera_correction: of the calibration, with which its image was processed.
     """
 
     stamp_ns: int
@@ -273,7 +283,7 @@ class FrameStatus(NamedTuple):
     scale: Scale
     stationary: bool
     keyframe: bool | None = None
-    k1: float = 0.0
+    camera_correction: Correction = AS_CALIBRATED
 
 
 def frame_status(message: Any) -> FrameStatus:
@@ -284,7 +294,7 @@ def frame_status(message: Any) -> FrameStatus:
         reference = values['reference_stamp_ns']
         return FrameStatus(stamp, Status(values['status']), int(reference) if reference else None,
                            Scale(values['length']), values['stationary'] == 'true',
-                           IS_KEYFRAME[values.get('keyframe', '')], k1_of(values.get('k1')))
+                           IS_KEYFRAME[values.get('keyframe', '')], correction_of(values))
     except (IndexError, KeyError, ValueError) as error:
         raise DjetError(f'the status of {stamp} ns lacks something: {error}') from None
 
@@ -324,9 +334,10 @@ class Messages(MessageFactory):
         One status: message and 'status' are the Status; 'reference_stamp_ns' is the stamp of the
         reference frame of the relative poses with the same stamp, empty without one; 'length' is
         metric, relative (to the first step of the track) or unknown; 'stationary' is true or
-        false; 'keyframe' too, or empty if none are chosen; 'k1' is the radial distortion,
-        estimated from landmarks, that was removed from the image. Level OK: there is a relative
-        pose; WARN: the odometry (re)started here; ERROR: a bad pair.
+        false; 'keyframe' too, or empty if none are chosen; 'k1', 'focal', 'cx' and 'cy' are the
+        `Correction` of the calibration, estimated from landmarks, with which the image was
+        processed. Level OK: there is a relative pose; WARN: the odometry (re)started here; ERROR:
+        a bad pair.
         """
         tracked = result.status in TRACKED
         level = 'OK' if tracked else 'WARN' if result.status in STARTED else 'ERROR'
@@ -338,7 +349,7 @@ class Messages(MessageFactory):
                 'length': (result.scale_kind if tracked else Scale.UNKNOWN).value,
                 'stationary': str(result.stationary).lower(),
                 'keyframe': KEYFRAME_WORDS[result.keyframe],
-                'k1': repr(float(result.k1))}, result.frame_id, frame)
+                **correction_values(result.camera_correction)}, result.frame_id, frame)
 
     def odometry(self, result: OdometryResult) -> Any:
         """

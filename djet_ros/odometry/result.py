@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from djet_ros.core.correction import AS_CALIBRATED, Correction
 from djet_ros.core.types import Array, RelativePose, Status
 from djet_ros.odometry.frame import Frame, Reference
 from djet_ros.odometry.scale import Common, Length, Scale
@@ -35,8 +36,8 @@ class OdometryResult:
     reference frame.
 
     keyframe: whether the frame is a keyframe of the sliding window, None if there is no window or
-    the motion is unknown; k1: radial distortion, estimated from landmarks, that was removed from
-    the image.
+    the motion is unknown; camera_correction: of the calibration, estimated from landmarks, with
+    which the image was processed.
     """
 
     stamp_ns: int
@@ -57,24 +58,25 @@ class OdometryResult:
     measured: bool = True
     common: Common | None = None
     keyframe: bool | None = None
-    k1: float = 0.0
+    camera_correction: Correction = AS_CALIBRATED
 
     @classmethod
     def without_pair(cls, frame: Frame, status: Status, pose: Array, pose_covariance: Array,
-                     keyframe: bool | None, k1: float) -> OdometryResult:
+                     keyframe: bool | None, correction: Correction) -> OdometryResult:
         """Return the result of a frame at which the odometry started or restarted."""
         return cls(frame.stamp_ns, frame.frame_id, status, None, None, np.eye(4), pose,
-                   UNKNOWN_MOTION, pose_covariance, 0.0, False, keyframe=keyframe, k1=k1)
+                   UNKNOWN_MOTION, pose_covariance, 0.0, False, keyframe=keyframe,
+                   camera_correction=correction)
 
     @classmethod
     def of_pair(cls, frame: Frame, reference: Reference, pair: RelativePose, length: Length,
                 motion: Array, motion_covariance: Array, pose: Array, pose_covariance: Array,
-                keyframe: bool | None, k1: float) -> OdometryResult:
+                keyframe: bool | None, correction: Correction) -> OdometryResult:
         """Return the result of a frame and its reference frame."""
         return cls(frame.stamp_ns, frame.frame_id, pair.status, reference.frame.stamp_ns, pair,
                    motion, pose, motion_covariance, pose_covariance, length.value, length.known,
                    False, reference.since_ns, reference.since_covariance, length.metric,
-                   length.measured, length.common, keyframe, k1)
+                   length.measured, length.common, keyframe, correction)
 
     @property
     def scale_kind(self) -> Scale:

@@ -75,6 +75,11 @@ class ScaleFilter:
         self.variance += variance
         self.metric = bool(self.metric and self.variance < _NOT_METRIC**2)
 
+    def unit_changed(self, ratio: float) -> None:
+        """Take lengths in units of the track that are longer by a ratio than those before."""
+        if self._was_metric:
+            self.log -= float(np.log(ratio))
+
     def scaled(self, units: float, sigma: float, measured: bool) -> Length:
         """
         Return a length in units of the track in metres, as far as the factor is known.

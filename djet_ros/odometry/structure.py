@@ -11,6 +11,7 @@ from copy import copy, deepcopy
 from dataclasses import replace
 from typing import NamedTuple
 
+from djet_ros.core.correction import Correction
 from djet_ros.core.covariance import lift, UNDETERMINED
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import sphere_tangents
@@ -66,8 +67,8 @@ class TrackScale:
     def __init__(self) -> None:
         self._estimator: EstimatorConfig | None = None
         self._uses_landmarks, self._filter = False, ScaleFilter()
-        # Survives an interruption of the track, as images stay undistorted by it.
-        self._lens: SelfCalibration | None = None
+        # Survives an interruption of the track, as images stay corrected by it.
+        self._calibration: SelfCalibration | None = None
         self.reset()
 
     def configure(self, estimator: EstimatorConfig, source: ScaleSource, share: float) -> bool:
@@ -90,7 +91,7 @@ class TrackScale:
         self._speed: float | None = None
         self._interrupted = False
         self._filter.reset()
-        self.forget_lens()
+        self.forget_calibration()
 
     @property
     def keyframe(self) -> bool | None:
@@ -118,30 +119,33 @@ class TrackScale:
         places = self._window.final_landmarks if settled else self._window.landmarks()
         return places * self._filter.factor
 
-    # Radial distortion
+    # Calibration
 
     @property
-    def lens(self) -> SelfCalibration | None:
-        """Return the distortion that landmarks have shown; None until it is significant."""
+    def calibration(self) -> SelfCalibration | None:
+        """Return what landmarks have shown to be wrong; None until it is significant."""
         if not self._uses_landmarks or self._speed is None:
             return None
-        lens = self._window.lens
-        return lens if lens.significant or lens.corrected_k1 else None
+        found = self._window.calibration
+        return found if found.significant or any(found.corrected) else None
 
     @property
-    def k1_due(self) -> float | None:
-        """Return the k1 that is to be removed from images from now on; None for no change."""
-        due = self._uses_landmarks and self._window.lens.needs_update
-        return self._window.lens.k1 if due else None
+    def correction_due(self) -> Correction | None:
+        """Return what images are to be corrected for from now on; None for no change."""
+        due = self._uses_landmarks and self._window.calibration.needs_update
+        return self._window.calibration.deviation if due else None
 
     def correct_images(self, newest: View) -> None:
-        """Continue with images without that k1; newest: the newest frame without it."""
-        self._window.correct_images(newest)
-        self._lens = self._window.lens
+        """Continue with images that are corrected so; newest: the newest frame."""
+        ratio = self._window.correct_images(newest)
+        if self._speed is not None:
+            self._speed *= ratio
+        self._filter.unit_changed(ratio)
+        self._calibration = self._window.calibration
 
-    def forget_lens(self) -> None:
-        """Forget the distortion when the track next begins."""
-        self._lens = None
+    def forget_calibration(self) -> None:
+        """Forget the estimate when the track next begins."""
+        self._calibration = None
 
     # Lengths
 
@@ -153,7 +157,7 @@ class TrackScale:
         """
         if not self._uses_landmarks:
             return
-        self._window.start(view, self._lens, None if self._speed is None else turn)
+        self._window.start(view, self._calibration, None if self._speed is None else turn)
         self._filter.restart_sum()
         self._interrupted = self._speed is not None
 
@@ -258,8 +262,8 @@ class TrackScale:
             except np.linalg.LinAlgError:
                 # Something is singular, or no match of a rotation is on a landmark.
                 addition = None
-            if self._lens is not None:
-                self._lens = self._window.lens
+            if self._calibration is not None:
+                self._calibration = self._window.calibration
             if addition is not None and np.isfinite(addition.sigma) and addition.length > 0:
                 self._filter.add_noise(noise**2)
                 self._interrupted = False

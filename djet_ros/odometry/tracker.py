@@ -19,11 +19,12 @@ from djet_ros.odometry.debug_image import debug_image
 from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.health import (
+    calibration_off,
     Complaint,
+    deviation_text,
     frame_mismatch,
     has_frame,
     Health,
-    residual_distortion,
     restart_reason,
 )
 from djet_ros.odometry.images import BadMessage
@@ -344,7 +345,7 @@ class Tracker:
     @property
     def _of_calibration(self) -> tuple[Complaint | None, ...]:
         frame = self.last.frame_id if self.last else ''
-        return residual_distortion(self._odometry.lens), frame_mismatch(self._info_frame, frame)
+        return calibration_off(self._odometry.calibration), frame_mismatch(self._info_frame, frame)
 
     @property
     def complaints_of_content(self) -> list[Complaint]:
@@ -365,8 +366,8 @@ class Tracker:
                              self.last, self._rate.hertz, self.complaints)
         diagnosis.values['scale source'] = self.config.odometry.scale
         diagnosis.values['inner loops'] = compiled.in_use()
-        if (lens := self._odometry.lens) is not None:
-            diagnosis.values['distortion left (k1)'] = f'{lens.k1:.4f} +- {lens.sigma:.4f}'
+        if (found := self._odometry.calibration) is not None:
+            diagnosis.values['calibration off by'] = deviation_text(found)
         diagnosis.values.update(self._inputs.values())
         diagnosis.values.update(self.node_values)
         return diagnosis

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from djet_ros.config.sections import OdometryConfig
+from djet_ros.core.correction import AS_CALIBRATED, Correction
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import norms
@@ -94,7 +95,7 @@ class VisualOdometry:
         other_features = started and estimator != self._estimator.config
         self._config, self._scale_source = odometry, scale
         self._estimator: TwoViewEstimator = TwoViewEstimator(
-            estimator, self._estimator.k1 if started else 0.0)
+            estimator, self._estimator.correction if started else AS_CALIBRATED)
         if other_features:
             self._reference = self._reference.seen_by(self._estimator)
         restart = self._scale.configure(estimator, scale, odometry.scale_uncertainty)
@@ -106,8 +107,8 @@ class VisualOdometry:
         self._priors.gyro, self._priors.guess = gyro, guess
 
     def recalibrated(self) -> None:
-        """Forget the estimated distortion, as the next images have another one."""
-        if self._last is not None and self._forget_distortion():
+        """Forget what was wrong with the calibration, as the next images have another one."""
+        if self._last is not None and self._forget_correction():
             self._renew_reference_view()
             self._scale.begin(self._reference.view)
 
@@ -119,7 +120,7 @@ class VisualOdometry:
     def _clear(self) -> None:
         self._last = None
         self._scale.reset()
-        self._forget_distortion()
+        self._forget_correction()
         self._last_pair: RelativePose | None = None
         self._bad_pairs = self._priors.known_ns = 0
         # Whether the last frame moved, and its reference was kept.
@@ -132,9 +133,9 @@ class VisualOdometry:
         return self._estimator
 
     @property
-    def lens(self) -> SelfCalibration | None:
-        """Return the distortion that landmarks have shown; None until it is significant."""
-        return self._scale.lens
+    def calibration(self) -> SelfCalibration | None:
+        """Return what landmarks have shown to be wrong with it; None until it is significant."""
+        return self._scale.calibration
 
     def landmarks(self, settled: bool = False) -> Array:
         """
@@ -159,7 +160,7 @@ class VisualOdometry:
         backwards = bool(last and frame.stamp_ns < last.stamp_ns)
         # After a gap it may also be of another camera.
         other_camera = last is not None and not of_same_camera(last, frame)
-        if (backwards or other_camera) and self._forget_distortion():
+        if (backwards or other_camera) and self._forget_correction():
             view = None
         # Detect its features, for this pair and for those whose reference it will be.
         if view is None:
@@ -286,7 +287,7 @@ class VisualOdometry:
         self._last_pair, self._bad_pairs = None, 0
         return OdometryResult.without_pair(
             frame, status, self._trajectory.pose, self._trajectory.path.pose,
-            self._scale.keyframe, self._estimator.k1)
+            self._scale.keyframe, self._estimator.correction)
 
     def _stationary(self, frame: Frame, pair: RelativePose, span: Span) -> OdometryResult:
         """Keep the pose and the reference."""
@@ -349,8 +350,8 @@ class VisualOdometry:
             self._refer_to(frame, view, pair)
         self._last_pair, self._bad_pairs, self._priors.known_ns = pair, 0, frame.stamp_ns
         self._standstill.take(pair, view.K, self._config.standstill)
-        if (k1 := self._scale.k1_due) is not None:
-            self._undistort(k1)
+        if (correction := self._scale.correction_due) is not None:
+            self._correct(correction)
         return result
 
     def _waits_for_parallax(self, pair: RelativePose, span: Span) -> bool:
@@ -381,14 +382,14 @@ class VisualOdometry:
         self._priors.forget_before(frame.stamp_ns)
         self._standstill.refer()
 
-    def _undistort(self, k1: float) -> None:
+    def _correct(self, correction: Correction) -> None:
         """
-        Remove a distortion that landmarks have shown, from the reference frame on.
+        Correct what landmarks have shown to be wrong, from the reference frame on.
 
         Pairs and the ground of ``camera_height`` are then without it; the window estimates what
         remains.
         """
-        self._estimator = TwoViewEstimator(self._estimator.config, k1)
+        self._estimator = TwoViewEstimator(self._estimator.config, correction)
         self._renew_reference_view()
         self._scale.correct_images(self._reference.view)
 
@@ -397,13 +398,13 @@ class VisualOdometry:
         self._reference = self._reference.seen_by(self._estimator)
         self._last_pair = _motion_alone(self._last_pair)
 
-    def _forget_distortion(self) -> bool:
-        """Take images as they come; returns whether a distortion was removed from them before."""
-        self._scale.forget_lens()
-        undistorted = self._estimator.k1 != 0
-        if undistorted:
+    def _forget_correction(self) -> bool:
+        """Take the camera as calibrated; returns whether that is a change."""
+        self._scale.forget_calibration()
+        corrected = any(self._estimator.correction)
+        if corrected:
             self._estimator = TwoViewEstimator(self._estimator.config)
-        return undistorted
+        return corrected
 
     def _result(self, frame: Frame, pair: RelativePose, length: Length, motion: Array,
                 covariance: Array, trajectory: Trajectory, keyframe: bool | None = None
@@ -411,7 +412,7 @@ class VisualOdometry:
         return OdometryResult.of_pair(
             frame, self._reference, pair, length, motion, covariance, trajectory.pose,
             trajectory.path.pose, None if self._scale.keyframe is None else keyframe,
-            self._estimator.k1)
+            self._estimator.correction)
 
 
 def _is_short(span: Span) -> bool:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from djet_ros.config.sections import Config, SlamConfig
+from djet_ros.core.correction import Correction
 from djet_ros.core.types import Array
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.uncertainty import compose, rotated
@@ -93,12 +94,12 @@ class _Pending(NamedTuple):
     """
     A keyframe that is queued for the loop search, and the edge from its predecessor.
 
-    k1: radial distortion that the odometry had corrected in it.
+    camera_correction: what the odometry had corrected in it.
     """
 
     frame: Frame
     before: Edge | None
-    k1: float
+    camera_correction: Correction
 
 
 class KeyframeMap:
@@ -209,7 +210,7 @@ class KeyframeMap:
             self._chain.append(before)
         factor = self.keyframes[-1].factor if self.keyframes else 1.0
         self.keyframes.append(Keyframe(step.stamp_ns, self.correction @ step.pose, factor))
-        self._pending.append(_Pending(frame, before, step.k1))
+        self._pending.append(_Pending(frame, before, step.camera_correction))
         if self._max_keyframes is not None and len(self.keyframes) > self._max_keyframes:
             self._forget_oldest()
         return KeyframeOffset(number)
@@ -219,8 +220,8 @@ class KeyframeMap:
         if not self._pending:
             return False
         number = self._searched
-        frame, before, k1 = self._pending.popleft()
-        self._finder.add(frame, before, k1)
+        frame, before, correction = self._pending.popleft()
+        self._finder.add(frame, before, correction)
         self._searched += 1
         self._finder.forget(min(self.first, self._searched))
         # Without an odometry edge to its predecessor, the length of a loop cannot be determined:

@@ -7,12 +7,13 @@ from collections.abc import Iterator, MutableMapping
 from dataclasses import replace
 
 from djet_ros.config.sections import SlamConfig
+from djet_ros.core.correction import AS_CALIBRATED, Correction
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import unit
 from djet_ros.core.masks import blocked
 from djet_ros.core.radial import undistort_image
-from djet_ros.core.types import of_same_camera, RelativePose, Status, TRACKED, View
+from djet_ros.core.types import Array, of_same_camera, RelativePose, Status, TRACKED, View
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.messages import LEAST_COVARIANCE
 from djet_ros.odometry.result import camera_motion
@@ -47,8 +48,8 @@ class EdgeFinder:
         # Elapsed time in ns at each keyframe; steps back in time count as 0.
         self._times: list[int] = []
         self._stamp_ns = self._time = 0
-        # The k1 that is corrected in the features of each keyframe.
-        self._lenses: list[float] = []
+        # What is corrected in the features of each keyframe.
+        self._corrections: list[Correction] = []
         self._places = PlaceIndex()
         # The odometry edge to each keyframe from its predecessor.
         self._before: dict[int, Edge] = {}
@@ -56,22 +57,24 @@ class EdgeFinder:
         # The newest keyframe, and its estimated motion back to its predecessor (cache).
         self._newest: tuple[int, RelativePose] | None = None
 
-    def add(self, frame: Frame, before: Edge | None = None, k1: float = 0.0) -> None:
+    def add(self, frame: Frame, before: Edge | None = None,
+            correction: Correction = AS_CALIBRATED) -> None:
         """
         Add the next keyframe, and the edge from its predecessor.
 
-        k1: radial distortion that the odometry had corrected in it.
+        correction: what the odometry had corrected in it.
         """
         number = self._first + len(self._times)
         gray, left_out = frame.gray, frame.left_out
-        if k1:
-            gray, left_out = undistort_image(gray, frame.K, k1, left_out)
+        if correction.k1:
+            gray, left_out = undistort_image(gray, correction.camera_matrix(frame.K),
+                                             correction.k1, left_out)
         features = self._near.features(gray, None if left_out is None else blocked(left_out))
         self._kept[number] = KeyframeImage(frame, features)
         self._time += max(frame.stamp_ns - self._stamp_ns, 0)
         self._stamp_ns = frame.stamp_ns
         self._times.append(self._time)
-        self._lenses.append(k1)
+        self._corrections.append(correction)
         self._places.add(features)
         if before is not None and before.kind == 'odometry':
             self._before[number] = before
@@ -81,7 +84,7 @@ class EdgeFinder:
         for number in range(self._first, first):
             self._kept.pop(number, None)
             self._before.pop(number, None)
-        del self._times[:first - self._first], self._lenses[:first - self._first]
+        del self._times[:first - self._first], self._corrections[:first - self._first]
         self._first = first
         self._places.forget(first)
 
@@ -101,8 +104,9 @@ class EdgeFinder:
                 yield from self._link(current, previous, float(np.linalg.norm(motion[:3, 3])))
 
     def _link(self, current: int, previous: int, guess: float) -> Iterator[Edge]:
-        k1 = self._lens(current)
-        relative = self._near.estimate(self._view(previous, k1), self._view(current, k1))
+        correction = self._correction(current)
+        relative = self._near.estimate(self._view(previous, correction),
+                                       self._view(current, correction))
         if relative.status is Status.OK and self._is_verified(relative):
             yield _edge(previous, current, relative, unknown(guess), 'link')
 
@@ -122,8 +126,8 @@ class EdgeFinder:
             yield from self._loop(current, place, units)
 
     def _loop(self, current: int, place: int, units: bool) -> Iterator[Edge]:
-        k1 = self._lens(current)
-        view, other = self._view(current, k1), self._view(place, k1)
+        correction = self._correction(current)
+        view, other = self._view(current, correction), self._view(place, correction)
         if not of_same_camera(view, other):
             return
         relative = self._wide.estimate(view, other)
@@ -136,26 +140,27 @@ class EdgeFinder:
     def _log_scale_ratio(self, current: int, place: int, loop: RelativePose,
                          length: Length) -> tuple[float, float] | None:
         """Estimate the ratio of the units at the ends of a loop, from points shared with steps."""
-        k1 = self._lens(current)
-        near, far = self._depths(current, k1), self._depths(place, k1)
+        correction = self._correction(current)
+        near, far = self._depths(current, correction), self._depths(place, correction)
         if not length.known or near is None or far is None:
             return None
-        return log_scale_ratio(*near, loop, length.value, *far, self._kept[current].frame.K)
+        return log_scale_ratio(*near, loop, length.value, *far, self._K(current))
 
-    def _depths(self, number: int, k1: float) -> tuple[RelativePose, float] | None:
+    def _depths(self, number: int, correction: Correction) -> tuple[RelativePose, float] | None:
         """Return the motion of a keyframe back to its predecessor and its length, or None."""
         step = self._before.get(number)
         if step is None or step.source not in self._kept or not step.scale_known:
             return None
-        back = self._back(number, step.source, k1)
+        back = self._back(number, step.source, correction)
         length = float(np.linalg.norm(step.motion[:3, 3]))
         return (back, length) if back.status is Status.OK and length else None
 
-    def _back(self, number: int, neighbour: int, k1: float) -> RelativePose:
+    def _back(self, number: int, neighbour: int, correction: Correction) -> RelativePose:
         """Estimate the motion back to the predecessor; cached for the newest keyframe."""
         if self._newest is not None and self._newest[0] == number:
             return self._newest[1]
-        back = self._near.estimate(self._view(number, k1), self._view(neighbour, k1))
+        back = self._near.estimate(self._view(number, correction),
+                                   self._view(neighbour, correction))
         if number == self._first + len(self._times) - 1:
             self._newest = number, back
         return back
@@ -169,34 +174,37 @@ class EdgeFinder:
         if relative.status is Status.NO_PARALLAX:
             # The same place: shorter than a step, in any direction.
             return Length(guess, guess, True)
-        depths = self._depths(current, self._lens(current))
+        depths = self._depths(current, self._correction(current))
         if depths is None:
             return unknown(guess)
         share = np.sqrt(_variance_along(step)) / guess
         return transferred_length(depths[0], relative, Length(guess, guess * share, True),
-                                  self._kept[current].frame.K)
+                                  self._K(current))
 
     def _is_verified(self, relative: RelativePose) -> bool:
         inliers = int(relative.inliers.sum())
         return (inliers >= self._config.loop_inliers
                 and inliers >= self._config.loop_share * len(relative.x))
 
-    def _lens(self, keyframe: int) -> float:
-        return self._lenses[keyframe - self._first]
+    def _correction(self, keyframe: int) -> Correction:
+        return self._corrections[keyframe - self._first]
 
-    def _view(self, keyframe: int, k1: float) -> View:
-        """
-        Return the view of a keyframe with the radial distortion k1 corrected.
+    def _K(self, keyframe: int) -> Array:
+        return self._correction(keyframe).camera_matrix(self._kept[keyframe].frame.K)
 
-        k1 is that of the newest keyframe of a loop: a later estimate also holds for earlier
-        keyframes. If it is 0 after a reset, the lens may be another, and each keyframe keeps its
-        own.
+    def _view(self, keyframe: int, correction: Correction) -> View:
         """
-        own = self._lens(keyframe)
-        k1 = k1 or own
+        Return the view of a keyframe, corrected.
+
+        By the correction of the newest keyframe of a loop: a later estimate also holds for earlier
+        keyframes. If there is none after a reset, the camera may be another, and each keyframe
+        keeps its own.
+        """
+        own = self._correction(keyframe)
+        correction = correction if any(correction) else own
         frame, features = self._kept[keyframe]
-        estimator = TwoViewEstimator(self._wide.config, k1) if k1 else self._wide
-        return estimator.view(frame.gray, frame.K, features if k1 == own else None,
+        estimator = TwoViewEstimator(self._wide.config, correction)
+        return estimator.view(frame.gray, frame.K, features if correction.k1 == own.k1 else None,
                               frame.left_out)
 
 

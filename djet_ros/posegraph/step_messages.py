@@ -127,7 +127,8 @@ class StepMessages:
         """Return the step of a frame by its Odometry and status alone."""
         _, pose = pose_of(odometry)
         return Step(status.stamp_ns, status.status, _of_camera(pose, self._mounting),
-                    odom_frame=odometry.header.frame_id, keyframe=status.keyframe, k1=status.k1,
+                    odom_frame=odometry.header.frame_id, keyframe=status.keyframe,
+                    camera_correction=status.camera_correction,
                     rotation_covariance=None if self._base_frame else rotation_covariance_of(
                         odometry, self._axes[:3, :3]))
 

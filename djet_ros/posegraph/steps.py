@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
+from djet_ros.core.correction import AS_CALIBRATED, Correction
 from djet_ros.core.types import Array, Status, TRACKED
 from djet_ros.odometry.scale import Scale
 from djet_ros.odometry.uncertainty import inflated_for_chain, symmetric, UNKNOWN_MOTION
@@ -25,8 +26,8 @@ class Step(Motion):
     previous_stamp_ns: of the reference frame of the motion, or None; motion (4, 4), covariance
     (6, 6): the camera in the reference frame, if estimated; odom_frame: frame id of the odometry,
     if from messages; metric: whether a known length is in metres; keyframe: whether the frame is
-    a keyframe of the odometry, None if it has none or this is not known; k1: radial distortion
-    that the odometry had found by its landmarks and corrected in the frame; rotation_covariance:
+    a keyframe of the odometry, None if it has none or this is not known; camera_correction:
+    what the odometry had found by its landmarks, and corrected in the frame; rotation_covariance:
     (3, 3) of the pose, in the axes of the odometry's frame, or None.
     """
 
@@ -40,7 +41,7 @@ class Step(Motion):
     odom_frame: str = ''
     metric: bool = True
     keyframe: bool | None = None
-    k1: float = 0.0
+    camera_correction: Correction = AS_CALIBRATED
     rotation_covariance: Array | None = None
 
     @property

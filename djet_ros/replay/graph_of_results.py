@@ -12,9 +12,10 @@ from typing import NamedTuple
 from djet_ros.config.safe_files import read_text
 from djet_ros.config.sections import Config, NODE_NAME
 from djet_ros.config.yaml_files import load_yaml
+from djet_ros.core.correction import Correction
 from djet_ros.core.types import Array, STARTED, Status, TRACKED
 from djet_ros.errors import DjetError
-from djet_ros.odometry.messages import IS_KEYFRAME, k1_of, OPTICAL_TO_BODY, pose_of
+from djet_ros.odometry.messages import correction_of, IS_KEYFRAME, OPTICAL_TO_BODY, pose_of
 from djet_ros.odometry.scale import Scale
 from djet_ros.odometry.uncertainty import rotated
 from djet_ros.posegraph.pose_graph import PoseGraph
@@ -76,7 +77,7 @@ class _Row(NamedTuple):
     previous_stamp_ns: int | None
     scale: Scale
     keyframe: bool | None
-    k1: float
+    camera_correction: Correction
 
 
 def _rows(path: Path) -> list[_Row]:
@@ -90,7 +91,7 @@ def _rows(path: Path) -> list[_Row]:
             rows.append(_Row(int(row['stamp_ns']), Status(row['status']),
                              int(previous) if previous else None,
                              Scale(row['scale_kind'] or Scale.UNKNOWN),
-                             IS_KEYFRAME[row.get('keyframe') or ''], k1_of(row.get('k1'))))
+                             IS_KEYFRAME[row.get('keyframe') or ''], correction_of(row)))
     except (csv.Error, KeyError, TypeError, ValueError) as error:
         raise DjetError(f'{path} line {reader.line_num} is not a row of a replay: '
                         f'{error}') from error
@@ -169,11 +170,13 @@ def _steps(rows: list[_Row], poses: Array, estimates: list[_Estimate | None],
                                 'is missing from the bag; replay the recording again')
             yield Step(row.stamp_ns, row.status, pose, row.previous_stamp_ns,
                        *motion, row.scale is not Scale.UNKNOWN,
-                       metric=row.scale is Scale.METRIC, keyframe=row.keyframe, k1=row.k1,
+                       metric=row.scale is Scale.METRIC, keyframe=row.keyframe,
+                       camera_correction=row.camera_correction,
                        rotation_covariance=covariance)
         elif row.status in STARTED or i in used:
             yield Step(row.stamp_ns, row.status, pose, row.previous_stamp_ns,
-                       keyframe=row.keyframe, k1=row.k1, rotation_covariance=covariance)
+                       keyframe=row.keyframe, camera_correction=row.camera_correction,
+                       rotation_covariance=covariance)
 
 
 def _references(rows: list[_Row]) -> list[int | None]:

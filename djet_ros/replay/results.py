@@ -25,10 +25,11 @@ from typing import Any
 import cv2
 from djet_ros.config.sections import Config, NODE_NAME
 from djet_ros.config.yaml_files import dump_yaml
+from djet_ros.core.correction import Correction
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.interrupts import interrupt_after
-from djet_ros.odometry.messages import KEYFRAME_WORDS
+from djet_ros.odometry.messages import correction_values, KEYFRAME_WORDS
 from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.tracker import Outgoing
 from djet_ros.posegraph.steps import Step
@@ -55,7 +56,7 @@ UNFINISHED = {'complete': False, 'error': 'the run did not complete'}
 
 COLUMNS = ('image', 'stamp_ns', 'status', 'reason', 'previous_stamp_ns', 'matches', 'inliers',
            'culled', 'iterations', 'median_residual_px', 'mean_hamming', 'scale', 'scale_kind',
-           'keyframe', 'k1', 'ms')
+           'keyframe', *Correction._fields, 'ms')
 
 
 class ResultsFolder(Closing):
@@ -117,7 +118,8 @@ class ResultsFolder(Closing):
         for trajectory in self._trajectories:
             trajectory.write(result.stamp_ns, result.pose)
         self._row((image, result.stamp_ns, result.status.value, '', *_details(result),
-                   KEYFRAME_WORDS[result.keyframe], repr(float(result.k1)),
+                   KEYFRAME_WORDS[result.keyframe],
+                   *correction_values(result.camera_correction).values(),
                    f'{1e3 * seconds:.2f}'))
 
     def add_unused(self, image: int, stamp_ns: int, reason: str) -> None:
@@ -206,7 +208,7 @@ class ResultsFolder(Closing):
 def _details(result: OdometryResult) -> tuple[Any, ...]:
     relative = result.relative
     if relative is None:
-        return ('',) * (len(COLUMNS) - 7)
+        return ('',) * (COLUMNS.index('keyframe') - COLUMNS.index('previous_stamp_ns'))
     residuals = np.abs(relative.residuals[relative.inliers])
     hamming = relative.hamming[np.isfinite(relative.hamming)]
     return (result.previous_stamp_ns, len(relative.x), int(relative.inliers.sum()),

@@ -1,0 +1,78 @@
+"""
+What the calibration of a camera gets wrong.
+
+Points u = (X/Z, Y/Z) appear at the pixels K' (1 + k1 |u|^2) u, where a calibration has K and no
+distortion left. K' has another focal length and principal point.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from djet_ros.core.geometry import rays, sphere_tangents
+from djet_ros.core.types import Array, RelativePose
+import numpy as np
+
+
+# Matches by which a pair is taken to depend on the camera, evenly sampled.
+_MATCHES = 300
+
+# Least information in any direction of a motion, relative to that of all.
+_LEAST = 1e-12
+
+
+class Correction(NamedTuple):
+    """
+    Deviation of a camera from its calibration.
+
+    k1: radial distortion; focal: relative change of the focal length; cx, cy: shift of the
+    principal point, as a share of the focal length. All zero: the calibration is right.
+    """
+
+    k1: float = 0.0
+    focal: float = 0.0
+    cx: float = 0.0
+    cy: float = 0.0
+
+    def camera_matrix(self, K: Array) -> Array:
+        """Return the corrected one of a calibrated camera matrix (3, 3)."""
+        corrected = np.array(K, np.float64)
+        corrected[:2, 2] += corrected[:2, :2] @ self[2:]
+        corrected[:2, :2] *= 1 + self.focal
+        return corrected
+
+
+AS_CALIBRATED = Correction()
+
+
+def motion_shift(pair: RelativePose, K: Array) -> Array:
+    """
+    Return how a correction of the camera would change the motion of a pair, (5, 4) by its fields.
+
+    K: (3, 3) of the pair, which needs a direction; the motion is in the parameters of its
+    covariance. It has the least squares of the inliers' distances from their epipolar lines, so it
+    adapts as their viewing rays are corrected.
+    """
+    inliers = np.flatnonzero(pair.inliers)
+    chosen = inliers[::max(len(inliers) // _MATCHES, 1)]
+    x, y = (rays(K, points[chosen]) for points in (pair.x, pair.y_opt))
+    turned = x @ pair.R.T
+    normals, across = np.cross(pair.t, turned), np.cross(y, pair.t)
+    by_motion = np.concatenate([np.cross(turned, across),
+                                np.cross(turned, y) @ sphere_tangents(pair.t)], axis=1)
+    by_camera = -(np.einsum('ni,nia->na', across @ pair.R[:, :2], displacements(x[:, :2]))
+                  + np.einsum('ni,nia->na', normals[:, :2], displacements(y[:, :2])))
+    weights = 1 / (normals[:, :2]**2).sum(1, keepdims=True)
+    weighted = (weights * by_motion).T
+    H = weighted @ by_motion
+    # What the matches leave undetermined stays.
+    return np.asarray(-np.linalg.solve(H + _LEAST * np.trace(H) * np.eye(5),
+                                       weighted @ by_camera))
+
+
+def displacements(u: Array) -> Array:
+    """Return how a deviation displaces points X/Z, Y/Z (N, 2): (N, 2, 4) by its fields."""
+    by_field = np.empty((len(u), 2, len(Correction._fields)))
+    by_field[:, :, 0], by_field[:, :, 1] = u * (u * u).sum(1, keepdims=True), u
+    by_field[:, :, 2:] = np.eye(2)
+    return by_field

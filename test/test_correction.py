@@ -1,0 +1,71 @@
+"""A camera that deviates from its calibration: its matrix, and what it does to a pair."""
+
+from __future__ import annotations
+
+import cv2
+from djet_ros.core.correction import AS_CALIBRATED, Correction, displacements, motion_shift
+from djet_ros.core.geometry import (
+    epipolar_lines,
+    fundamental,
+    line_distances,
+    rays,
+    rotation_exp,
+    rotation_log,
+    sphere_log,
+    sphere_tangents,
+    unit,
+)
+from djet_ros.core.types import RelativePose, Status
+import numpy as np
+from numpy.typing import NDArray
+import pytest
+from scipy.optimize import least_squares
+
+Numbers = NDArray[np.float64]
+
+K = np.array([[700.0, 0, 600], [0, 710, 180], [0, 0, 1]])
+
+
+def seen(places: Numbers, correction: Correction) -> Numbers:
+    """Pixels (N, 2) at which a camera that deviates from K shows points (N, 3), by OpenCV."""
+    pixels, _ = cv2.projectPoints(places, np.zeros(3), np.zeros(3), correction.camera_matrix(K),
+                                  np.array([correction.k1, 0, 0, 0]))
+    return np.asarray(pixels[:, 0])
+
+
+def test_a_camera_as_calibrated_has_the_calibrated_matrix() -> None:
+    assert np.array_equal(AS_CALIBRATED.camera_matrix(K), K)
+    assert AS_CALIBRATED.camera_matrix(K) is not K
+
+
+def test_focal_length_and_principal_point_deviate_by_shares_of_the_focal_length() -> None:
+    corrected = Correction(focal=0.01, cx=0.002, cy=-0.003).camera_matrix(K)
+    assert corrected == pytest.approx(np.array([[707, 0, 601.4], [0, 717.1, 177.87], [0, 0, 1]]))
+
+
+@pytest.mark.parametrize('field', range(4))
+def test_points_are_displaced_as_by_that_camera(field: int) -> None:
+    rng, wrong = np.random.default_rng(0), 1e-6 * np.eye(4)[field]
+    u = rng.uniform(-0.8, 0.8, (50, 2))
+    places = np.column_stack([u, np.ones(50)])
+    moved = (seen(places, Correction(*wrong)) - seen(places, AS_CALIBRATED)) / np.diag(K)[:2]
+    assert displacements(u) @ wrong == pytest.approx(moved, rel=1e-4, abs=1e-12)
+
+
+@pytest.mark.parametrize('field', range(4))
+def test_a_pair_is_off_by_what_least_squares_makes_of_a_wrong_camera(field: int) -> None:
+    rng, wrong = np.random.default_rng(1), 1e-3 * np.eye(4)[field]
+    R, t = rotation_exp(np.array([0.01, -0.05, 0.004])), unit(np.array([0.3, -0.05, -0.9]))
+    places = rng.uniform(6, 40, (400, 1)) * rays(K, rng.uniform((20, 20), (1200, 340), (400, 2)))
+    x, y = (seen(points, Correction(*wrong)) for points in (places, places @ R.T + t))
+
+    def moved(step: Numbers) -> tuple[Numbers, Numbers]:
+        return rotation_exp(step[:3]) @ R, unit(t + sphere_tangents(t) @ step[3:])
+
+    found, direction = moved(least_squares(lambda step: line_distances(
+        epipolar_lines(fundamental(K, *moved(step)), x), y), np.zeros(5)).x)
+    off = np.concatenate([rotation_log(found @ R.T), sphere_log(t, direction)])
+    pair = RelativePose(Status.OK, R, t, np.eye(5), x=x, y=y, y_opt=y, inliers=np.ones(400, bool))
+    # A correction of the camera would take that back.
+    assert motion_shift(pair, K) @ wrong == pytest.approx(-off, rel=0.05,
+                                                          abs=0.03 * np.abs(off).max())
