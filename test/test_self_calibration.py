@@ -138,6 +138,21 @@ def test_images_are_corrected_for_what_is_significant_a_few_times_in_all() -> No
     assert np.abs((np.array(found.deviation) - WRONG) / found.sigmas).max() < 2.5
 
 
+def test_what_windows_missed_before_a_correction_is_found_after_it() -> None:
+    """Landmarks that disagree most are outliers until images are corrected."""
+    rng, found = np.random.default_rng(4), unknown()
+    while not found.needs_update:
+        found = after(found, 0.65 * WRONG + noisy(rng, TURN, 0.03), TURN, 0.03)
+    found = found.after_correction()
+    for _ in range(60):
+        found = after(found, WRONG + noisy(rng, TURN, 0.03), TURN, 0.03)
+        if found.needs_update:
+            found = found.after_correction()
+    error = np.array(found.deviation) - WRONG
+    assert np.abs(error / found.sigmas).max() < 2.5
+    assert np.abs(error).max() < 0.1 * np.abs(WRONG).max()
+
+
 def test_noise_is_not_taken_for_a_wrong_calibration() -> None:
     rng = np.random.default_rng(2)
     for _ in range(20):

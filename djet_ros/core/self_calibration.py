@@ -38,6 +38,9 @@ _SUBSETS = np.array(list(np.ndindex(*[2] * _COUNT)), bool)
 # not all are.
 _PRIOR_ODDS, _DOUBT = 5.0, 0.01
 
+# chosen: standard deviation of what windows miss of a deviation, relative to what they find.
+_MISSED = 0.4
+
 # Least share of the largest sensitivity: directions below are not measured.
 _LEAST_SENSITIVITY = 1e-9
 
@@ -119,8 +122,16 @@ class SelfCalibration:
         return bool(change @ np.linalg.solve(self.covariance[:_COUNT, :_COUNT], change) > _COUNT)
 
     def after_correction(self) -> SelfCalibration:
-        """Return the same after images have been corrected for the deviation."""
-        return replace(self, corrected=self.deviation)
+        """
+        Return the same after images have been corrected for the deviation.
+
+        Windows before saw only part of it, for landmarks that disagreed most were outliers: from
+        now on it is less certain along what was corrected.
+        """
+        covariance = self.covariance.copy()
+        missed = _MISSED * np.subtract(self.deviation, self.corrected) / self.prior_sigmas
+        covariance[:_COUNT, :_COUNT] += np.outer(missed, missed)
+        return replace(self, corrected=self.deviation, covariance=covariance)
 
     def update(self, sensitivity: Array, gradient: Array, noise: float) -> SelfCalibration:
         """
