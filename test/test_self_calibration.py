@@ -9,12 +9,13 @@ from typing import Any
 
 import cv2
 from djet_ros.config.sections import Config, OdometryConfig
+from djet_ros.core.correction import Correction
 from djet_ros.core.geometry import rotation_log
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Status, TRACKED
 from djet_ros.lab.scenes import make_scene, Scene
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.messages import Messages
+from djet_ros.odometry.messages import correction_of, correction_values, Messages
 from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.tracker import Outgoing, Tracker
 from djet_ros.odometry.visual_odometry import VisualOdometry
@@ -256,6 +257,17 @@ def test_the_back_end_gets_the_correction_of_each_image(
     assert [step.camera_correction for step in live] == corrections
     assert [step.camera_correction for step in read_steps(
         tmp_path / 'results')] == corrections
+
+
+@pytest.mark.parametrize('field', Correction._fields)
+def test_a_correction_comes_back_from_its_texts_or_is_refused(field: str) -> None:
+    correction = Correction(*WRONG.tolist())
+    assert correction_of(correction_values(correction)) == correction
+    # Results of an earlier version have a k1 alone, or nothing.
+    assert correction_of({'k1': '0.02', 'focal': None}) == Correction(0.02)
+    for word in ('nan', 'inf', '1e300', '-5e3', 'wide'):
+        with pytest.raises(ValueError, match='correction of the camera|could not convert'):
+            correction_of({**correction_values(correction), field: word})
 
 
 @pytest.mark.slow

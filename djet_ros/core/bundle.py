@@ -199,7 +199,7 @@ class Landmarks:
         """Create landmarks without observations; fronto-parallel ones without slopes."""
         n = len(rho)
         return cls(np.full(n, anchor, np.int64), anchor_pixels, np.zeros((n, 2, 2)),
-                   anchor_pixels, rho,
+                   anchor_pixels.copy(), rho,
                    np.zeros((n, 2)) if slopes is None else slopes,
                    np.ones(n) if strengths is None else strengths, np.zeros(n, np.int64),
                    np.zeros((n, frames, 2)), np.zeros((n, frames, 2, 2)),

@@ -110,13 +110,13 @@ class SelfCalibration:
         """
         Return whether images should be corrected anew.
 
-        If the deviation is significant, and differs from what is corrected by more than the
-        uncertainty, a standard deviation for each parameter. That is so when it becomes
+        If the deviation is significant, or was, and differs from what is corrected by more than
+        the uncertainty, a standard deviation for each parameter. That is so when it becomes
         significant, and about each time that its variance has halved: a few times in all. With
         each correction the lengths of steps change, so one that fluctuates would cost more than
         one that is never made.
         """
-        if not self.significant:
+        if not (self.significant or any(self.corrected)):
             return False
         change = np.subtract(self.deviation, self.corrected) / self.prior_sigmas
         return bool(change @ np.linalg.solve(self.covariance[:_COUNT, :_COUNT], change) > _COUNT)

@@ -40,6 +40,9 @@ FARTHEST = 1e9
 # The camera's axes in the body's: optical z is forward, x is right, y is down (REP 103).
 OPTICAL_TO_BODY = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
+# Bounds of what a calibration can have been wrong about; that of k1 is for the longest lenses.
+_LARGEST_CORRECTION = Correction(k1=1e3, focal=0.9, cx=10.0, cy=10.0)
+
 # Values of 'keyframe' in the status of a frame; empty if no keyframes are chosen.
 KEYFRAME_WORDS = {True: 'true', False: 'false', None: ''}
 IS_KEYFRAME = {word: chosen for chosen, word in KEYFRAME_WORDS.items()}
@@ -259,10 +262,10 @@ def correction_of(values: Mapping[str, str | None]) -> Correction:
     """
     Return the correction in ``correction_values`` among other values; what is missing is zero.
 
-    Raises ValueError if it is not finite, or leaves no focal length.
+    Raises ValueError if it is no correction of any camera.
     """
     correction = Correction(*(float(values.get(name) or 0.0) for name in Correction._fields))
-    if not np.isfinite(correction).all() or correction.focal <= -1:
+    if not (np.abs(correction) <= _LARGEST_CORRECTION).all():
         raise ValueError(f'the correction of the camera is {tuple(correction)}')
     return correction
 
