@@ -4,22 +4,12 @@ from __future__ import annotations
 
 import cv2
 from djet_ros.core.correction import AS_CALIBRATED, Correction, displacements, motion_shift
-from djet_ros.core.geometry import (
-    epipolar_lines,
-    fundamental,
-    line_distances,
-    rays,
-    rotation_exp,
-    rotation_log,
-    sphere_log,
-    sphere_tangents,
-    unit,
-)
+from djet_ros.core.geometry import rays, rotation_exp, rotation_log, sphere_log, unit
 from djet_ros.core.types import RelativePose, Status
 import numpy as np
 from numpy.typing import NDArray
 import pytest
-from scipy.optimize import least_squares
+from two_view import fitted
 
 Numbers = NDArray[np.float64]
 
@@ -58,12 +48,7 @@ def test_a_pair_is_off_by_what_least_squares_makes_of_a_wrong_camera(field: int)
     R, t = rotation_exp(np.array([0.01, -0.05, 0.004])), unit(np.array([0.3, -0.05, -0.9]))
     places = rng.uniform(6, 40, (400, 1)) * rays(K, rng.uniform((20, 20), (1200, 340), (400, 2)))
     x, y = (seen(points, Correction(*wrong)) for points in (places, places @ R.T + t))
-
-    def moved(step: Numbers) -> tuple[Numbers, Numbers]:
-        return rotation_exp(step[:3]) @ R, unit(t + sphere_tangents(t) @ step[3:])
-
-    found, direction = moved(least_squares(lambda step: line_distances(
-        epipolar_lines(fundamental(K, *moved(step)), x), y), np.zeros(5)).x)
+    found, direction = fitted(K, R, t, x, y)
     off = np.concatenate([rotation_log(found @ R.T), sphere_log(t, direction)])
     pair = RelativePose(Status.OK, R, t, np.eye(5), x=x, y=y, y_opt=y, inliers=np.ones(400, bool))
     # A correction of the camera would take that back.

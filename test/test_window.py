@@ -26,7 +26,7 @@ from djet_ros.core.window import Window, WINDOW_TUNING
 import numpy as np
 from numpy.typing import NDArray
 import pytest
-from scipy.optimize import least_squares
+from two_view import fitted
 
 Numbers = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -95,17 +95,6 @@ class Street:
             Status.OK, R, t, np.eye(5) * max(_SURE, self.turned)**2, x=x, y=y, y_opt=y,
             residuals=line_distances(epipolar_lines(fundamental(self.shown[0], R, t), x), y),
             inliers=np.ones(len(which), bool))
-
-
-def fitted(matrix: Numbers, R: Numbers, t: Numbers, x: Numbers, y: Numbers
-           ) -> tuple[Numbers, Numbers]:
-    """Motion near (R, t) with the least distances from epipolar lines, as a pair would find it."""
-    def moved(step: Numbers) -> tuple[Numbers, Numbers]:
-        return rotation_exp(step[:3]) @ R, unit(t + sphere_tangents(t) @ step[3:])
-
-    best = least_squares(lambda step: line_distances(
-        epipolar_lines(fundamental(matrix, *moved(step)), x), y), np.zeros(5))
-    return moved(best.x)
 
 
 class NumbersWindow(Window):

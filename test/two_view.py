@@ -7,9 +7,17 @@ from dataclasses import dataclass
 
 import cv2
 from djet_ros.core.estimator import TwoViewEstimator
-from djet_ros.core.geometry import unit
+from djet_ros.core.geometry import (
+    epipolar_lines,
+    fundamental,
+    line_distances,
+    rotation_exp,
+    sphere_tangents,
+    unit,
+)
 from djet_ros.core.types import Features, View
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 # KITTI's gray camera, and one whose pixels are neither square nor upright.
@@ -155,3 +163,16 @@ def flight_over_a_plane(rng: np.random.Generator, count: int
         step, turn = step + rng.normal(0, 0.01, 3), turn + rng.normal(0, 0.2, 3)
         place, R = place + step, R * Rotation.from_rotvec(0.01 * turn)
     return lens, pictures, poses
+
+
+def fitted(K, R, t, x, y):
+    """
+    Return the motion near (R, t) with the least distances from epipolar lines, as pairs find it.
+
+    x, y: (N, 2) matched pixels.
+    """
+    def moved(step):
+        return rotation_exp(step[:3]) @ R, unit(t + sphere_tangents(t) @ step[3:])
+
+    return moved(least_squares(lambda step: line_distances(
+        epipolar_lines(fundamental(K, *moved(step)), x), y), np.zeros(5)).x)

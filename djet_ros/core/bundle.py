@@ -24,7 +24,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 from djet_ros import compiled
-from djet_ros.core.correction import Correction, displacements
+from djet_ros.core.correction import displacements, OF_CAMERA
 from djet_ros.core.geometry import inverse_intrinsics, rays, rotation_exp, rotation_log
 from djet_ros.core.paraboloid import median, times
 from djet_ros.core.radial import distort, distortion_jacobian, undistort
@@ -34,9 +34,6 @@ from numpy.typing import NDArray
 
 # Least depth of a projection, in units of the landmark's depth in its anchor.
 _MIN_DEPTH = 1e-3
-
-# Parameters of the camera.
-_OF_CAMERA = len(Correction._fields)
 
 # Bound of projected pixels; it fits into an integer.
 _MAX_PIXEL = 1e6
@@ -123,28 +120,28 @@ class PosePrior:
     @classmethod
     def holding(cls, pose: Poses) -> PosePrior:
         """Return a prior that fixes the first pose."""
-        return cls(np.diag(np.repeat([0.0, _FIXED], [_OF_CAMERA, 6])), np.zeros(_OF_CAMERA + 6),
+        return cls(np.diag(np.repeat([0.0, _FIXED], [OF_CAMERA, 6])), np.zeros(OF_CAMERA + 6),
                    pose)
 
     @property
     def of_poses(self) -> Array:
         """Return the Hessian (6 F, 6 F) over the poses."""
-        return self.H[_OF_CAMERA:, _OF_CAMERA:]
+        return self.H[OF_CAMERA:, OF_CAMERA:]
 
     def at(self, poses: Poses) -> PriorCost:
         """Return the cost of poses and its gradient."""
-        step, g = poses.step_from(self.linearised_at), self.g[_OF_CAMERA:]
+        step, g = poses.step_from(self.linearised_at), self.g[OF_CAMERA:]
         pull = self.of_poses @ step
         return PriorCost(float(step @ (pull / 2 + g)), np.asarray(g + pull))
 
     def add(self, H: Array, g: Array, poses: Poses) -> None:
         """Add information H (4 + 6 F, 4 + 6 F), g linearised at `poses`."""
         self.H += H
-        self.g += g - H[:, _OF_CAMERA:] @ poses.step_from(self.linearised_at)
+        self.g += g - H[:, OF_CAMERA:] @ poses.step_from(self.linearised_at)
 
     def with_corrected_camera(self, change: Array) -> PosePrior:
         """Return the prior relative to a camera that is corrected by a change (4,)."""
-        return replace(self, g=self.g + self.H[:, :_OF_CAMERA] @ change)
+        return replace(self, g=self.g + self.H[:, :OF_CAMERA] @ change)
 
     def with_frame(self, R: Array, t: Array) -> PosePrior:
         """Return the prior with one more pose, without information on it."""
@@ -154,7 +151,7 @@ class PosePrior:
     def without_frame(self, frame: int) -> PosePrior:
         """Return the prior with a frame marginalised out."""
         removed = np.zeros(len(self.H), bool)
-        removed[_OF_CAMERA + 6 * frame:][:6] = True
+        removed[OF_CAMERA + 6 * frame:][:6] = True
         block, coupling = self.H[np.ix_(removed, removed)], self.H[np.ix_(~removed, removed)]
         # After a pure rotation, only the rotation of a frame may be constrained.
         block = block + np.diag(1e-9 * np.diag(block) + _WEAK)
@@ -427,12 +424,12 @@ class Reduced:
 
     def of_camera(self) -> CameraEquations:
         """Marginalise the poses too, without any prior on them."""
-        count = _OF_CAMERA
-        H, coupling = self.H[count:, count:], self.H[count:, :count]
+        H, coupling = self.H[OF_CAMERA:, OF_CAMERA:], self.H[OF_CAMERA:, :OF_CAMERA]
         # Position and scale are gauge freedoms.
         gain = np.linalg.solve(H + np.diag(_GAUGE * np.diag(H) + _WEAK), coupling).T
-        reduced = self.H[:count, :count] - gain @ coupling
-        return CameraEquations((reduced + reduced.T) / 2, self.g[:count] - gain @ self.g[count:])
+        reduced = self.H[:OF_CAMERA, :OF_CAMERA] - gain @ coupling
+        return CameraEquations((reduced + reduced.T) / 2,
+                               self.g[:OF_CAMERA] - gain @ self.g[OF_CAMERA:])
 
     def change(self, step: Array) -> Array:
         """Return the steps (N, 3) of the landmarks for a step (4 + 6 F,) of camera and poses."""
@@ -462,7 +459,7 @@ def eliminate(observed: Observed, weights: Array, weight: float, frames: int) ->
             (o.normalised, o.anchor_roots, o.anchor_residuals, weight),
             (o.K, inverse_intrinsics(o.K)), _LIMITS, _DEPTH_INFORMATION, frames))
     n, linear = len(observed.anchor_residuals), jacobians(observed)
-    size = _OF_CAMERA + 6 * frames
+    size = OF_CAMERA + 6 * frames
     root = np.sqrt(weights)[:, None, None]
     by_frame, by_anchor = linear.by_frame * root, linear.by_anchor * root
     e, back = observed.residuals * root[:, 0], (linear.by_own * root).transpose(0, 2, 1)
@@ -475,11 +472,11 @@ def eliminate(observed: Observed, weights: Array, weight: float, frames: int) ->
     transposed = points_by_own.transpose(0, 2, 1) * weight
     information[:, 1:, 1:] += transposed @ points_by_own
     slopes[:, 1:] = times(transposed, observed.anchor_residuals)
-    with_camera, coupling = np.zeros((n, 3, _OF_CAMERA)), np.zeros((n, frames, 3, 6))
+    with_camera, coupling = np.zeros((n, 3, OF_CAMERA)), np.zeros((n, frames, 3, 6))
     with_camera[:, 1:] = transposed @ points_by_camera
-    H[:_OF_CAMERA, :_OF_CAMERA] += weight * np.einsum(
+    H[:OF_CAMERA, :OF_CAMERA] += weight * np.einsum(
         'nia,nib->ab', points_by_camera, points_by_camera)
-    g[:_OF_CAMERA] += weight * np.einsum(
+    g[:OF_CAMERA] += weight * np.einsum(
         'nia,ni->a', points_by_camera, observed.anchor_residuals)
     # Each frame observes a landmark once, and each landmark has one anchor.
     coupling[observed.landmark, observed.frame] = back @ by_frame

@@ -13,7 +13,6 @@ from djet_ros.core.geometry import rays, sphere_tangents
 from djet_ros.core.types import Array, RelativePose
 import numpy as np
 
-
 # Matches by which a pair is taken to depend on the camera, evenly sampled.
 _MATCHES = 300
 
@@ -44,6 +43,9 @@ class Correction(NamedTuple):
 
 AS_CALIBRATED = Correction()
 
+# Number of parameters of a camera: the fields of a Correction.
+OF_CAMERA = len(Correction._fields)
+
 
 def motion_shift(pair: RelativePose, K: Array) -> Array:
     """
@@ -72,7 +74,7 @@ def motion_shift(pair: RelativePose, K: Array) -> Array:
 
 def displacements(u: Array) -> Array:
     """Return how a deviation displaces points X/Z, Y/Z (N, 2): (N, 2, 4) by its fields."""
-    by_field = np.empty((len(u), 2, len(Correction._fields)))
+    by_field = np.empty((len(u), 2, OF_CAMERA))
     by_field[:, :, 0], by_field[:, :, 1] = u * (u * u).sum(1, keepdims=True), u
     by_field[:, :, 2:] = np.eye(2)
     return by_field

@@ -94,8 +94,7 @@ class TwoViewEstimator:
         """
         require_gray(gray, np.asarray(K))
         K = self.correction.camera_matrix(K)
-        if self.correction.k1:
-            gray, left_out = undistort_image(gray, K, self.correction.k1, left_out)
+        gray, left_out = undistort_image(gray, K, self.correction.k1, left_out)
         mask = None if left_out is None else blocked(left_out)
         smoothed = smooth(gray)
         if features is None:
@@ -105,9 +104,7 @@ class TwoViewEstimator:
 
     def undistorted(self, gray: NDArray[np.uint8], K: Array) -> NDArray[np.uint8]:
         """Return an image (H, W) undistorted as in its views, to whose pixels results refer."""
-        correction = self.correction
-        return gray if not correction.k1 else undistort_image(
-            gray, correction.camera_matrix(K), correction.k1)[0]
+        return undistort_image(gray, self.correction.camera_matrix(K), self.correction.k1)[0]
 
     def features(self, gray: NDArray[np.uint8], mask: Mask | None = None) -> Features:
         """Detect all features of a gray image (H, W) uint8, except where a mask (H, W) is True."""

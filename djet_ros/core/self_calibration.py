@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from djet_ros.core.correction import AS_CALIBRATED, Correction
+from djet_ros.core.correction import AS_CALIBRATED, Correction, OF_CAMERA
 from djet_ros.core.geometry import rays
 from djet_ros.core.types import Array
 import numpy as np
@@ -30,9 +30,8 @@ _SYSTEMATIC_ERROR = 0.01
 # standard deviation of that, relative to the prior one.
 _MODEL_ERROR = 0.2
 
-# Number of parameters, and which of them may be right: none of them, at last all.
-_COUNT = len(Correction._fields)
-_SUBSETS = np.array(list(np.ndindex(*[2] * _COUNT)), bool)
+# Which parameters may be right: none of them, at last all.
+_SUBSETS = np.array(list(np.ndindex(*[2] * OF_CAMERA)), bool)
 
 # chosen: prior odds that a parameter is right, and probability below which it is beyond doubt that
 # not all are.
@@ -67,21 +66,25 @@ class SelfCalibration:
         height, width = shape
         corners = rays(K, np.array([[0, 0], [width, 0], [0, height], [width, height]]))[:, :2]
         farthest = float(np.linalg.norm(corners, axis=1).max())
-        prior = np.repeat([1.0, _SYSTEMATIC_ERROR], _COUNT)**2
-        return cls(np.zeros(2 * _COUNT), np.diag(prior),
+        prior = np.repeat([1.0, _SYSTEMATIC_ERROR], OF_CAMERA)**2
+        return cls(np.zeros(2 * OF_CAMERA), np.diag(prior),
                    np.array([_CORNER_DISPLACEMENT / farthest**2, _SHARE, _SHARE, _SHARE]),
                    np.diag(K)[:2])
 
     @property
     def deviation(self) -> Correction:
         """Return the deviation, if there is any."""
-        return Correction(*(self.mean[:_COUNT] * self.prior_sigmas).tolist())
+        return Correction(*(self.mean[:OF_CAMERA] * self.prior_sigmas).tolist())
 
     @property
     def sigmas(self) -> Correction:
         """Return its standard deviations."""
         return Correction(
-            *(np.sqrt(np.diag(self.covariance)[:_COUNT]) * self.prior_sigmas).tolist())
+            *(np.sqrt(np.diag(self.covariance)[:OF_CAMERA]) * self.prior_sigmas).tolist())
+
+    @property
+    def _of_fields(self) -> Array:
+        return self.covariance[:OF_CAMERA, :OF_CAMERA]
 
     @cached_property
     def _right(self) -> float:
@@ -92,7 +95,7 @@ class SelfCalibration:
         The odds that some are right grow by the ratio of posterior to prior density where they are
         zero (Dickey, Annals of Mathematical Statistics 1971).
         """
-        mean, covariance = self.mean[:_COUNT], self.covariance[:_COUNT, :_COUNT]
+        mean, covariance = self.mean[:OF_CAMERA], self._of_fields
         logs = []
         for right in _SUBSETS:
             block = covariance[np.ix_(right, right)]
@@ -119,7 +122,7 @@ class SelfCalibration:
         if not (self.significant or any(self.corrected)):
             return False
         change = np.subtract(self.deviation, self.corrected) / self.prior_sigmas
-        return bool(change @ np.linalg.solve(self.covariance[:_COUNT, :_COUNT], change) > _COUNT)
+        return bool(change @ np.linalg.solve(self._of_fields, change) > OF_CAMERA)
 
     def after_correction(self) -> SelfCalibration:
         """
@@ -130,7 +133,7 @@ class SelfCalibration:
         """
         covariance = self.covariance.copy()
         missed = _MISSED * np.subtract(self.deviation, self.corrected) / self.prior_sigmas
-        covariance[:_COUNT, :_COUNT] += np.outer(missed, missed)
+        covariance[:OF_CAMERA, :OF_CAMERA] += np.outer(missed, missed)
         return replace(self, corrected=self.deviation, covariance=covariance)
 
     def update(self, sensitivity: Array, gradient: Array, noise: float) -> SelfCalibration:

@@ -30,7 +30,7 @@ from djet_ros.core.bundle import (
     projected,
     Reduced,
 )
-from djet_ros.core.correction import motion_shift
+from djet_ros.core.correction import motion_shift, OF_CAMERA
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import (
     inverse_depths,
@@ -188,7 +188,7 @@ class Window:
         self._prior = PosePrior.holding(self._poses)
         self._scale = 1.0
         # Derivatives of the logarithm of the newest length by what may be wrong with the camera.
-        self._length_by_camera = np.zeros(4)
+        self._length_by_camera = np.zeros(OF_CAMERA)
         # The newest camera as it was published, in the frame of the oldest keyframe; its pose may
         # have been refined since.
         self._published = np.eye(4)
@@ -308,7 +308,7 @@ class Window:
         """Move poses and landmarks by what a change (4,) of the camera makes of them."""
         published = np.linalg.inv(self._poses.camera(-1)) @ self._published
         reduced = self._reduced(self._observed())
-        _, by_camera = self._poses_of_camera(reduced)
+        by_camera = self._poses_by_camera(reduced)
         # To first order, so long lengths must not become negative.
         drift = abs(float(self._newest_by_camera(by_camera) @ change))
         change = change * min(self._tuning.most_drift / max(drift, 1e-9), 1.0)
@@ -509,12 +509,12 @@ class Window:
                            + np.outer(along, along))
             gradient = along * (length - expected.length) / expected.sigma
         else:
-            by_poses = np.concatenate([np.zeros((3, 4)), J[:3]], axis=1)
+            by_poses = np.concatenate([np.zeros((3, OF_CAMERA)), J[:3]], axis=1)
             information = by_poses.T @ by_poses * _ROTATION_INFORMATION
-            gradient = np.zeros(16)
+            gradient = np.zeros(OF_CAMERA + 12)
         H, g = np.zeros_like(self._prior.H), np.zeros_like(self._prior.g)
         # The camera comes first, the newest two frames last.
-        places = np.r_[:4, len(g) - 12:len(g)]
+        places = np.r_[:OF_CAMERA, len(g) - 12:len(g)]
         H[np.ix_(places, places)], g[places] = information, gradient
         self._prior.add(H, g, self._poses)
 
@@ -574,11 +574,11 @@ class Window:
         observed, prior = self._observed(), self._prior.at(self._poses)
         for _ in range(self._tuning.steps):
             reduced = self._reduced(observed)
-            H, by_camera = self._poses_of_camera(reduced)
-            step = -_solved(H, prior.gradient + reduced.g[4:])
+            H = self._prior.of_poses + reduced.H[OF_CAMERA:, OF_CAMERA:]
+            step = -_solved(H, prior.gradient + reduced.g[OF_CAMERA:])
             observed, prior = self._line_search(observed, prior, step, reduced.change(
-                np.concatenate([np.zeros(4), step])))
-        self._length_by_camera = self._newest_by_camera(by_camera)
+                np.concatenate([np.zeros(OF_CAMERA), step])))
+        self._length_by_camera = self._newest_by_camera(self._poses_by_camera(reduced))
         outliers = norms(observed.residuals) > self._tuning.outlier * self._scale
         self._landmarks.observed[observed.landmark[outliers], observed.frame[outliers]] = False
         np.subtract.at(self._landmarks.observation_counts, observed.landmark[outliers], 1)
@@ -588,10 +588,10 @@ class Window:
             np.asarray(self._landmarks.observed.any(1) & in_front))
         return H
 
-    def _poses_of_camera(self, reduced: Reduced) -> tuple[Array, Array]:
-        """Return the Hessian (6 F, 6 F) over the poses, and how they depend on the camera."""
-        whole = self._prior.H + reduced.H
-        return whole[4:, 4:], -_solved(whole[4:, 4:], whole[4:, :4])
+    def _poses_by_camera(self, reduced: Reduced) -> Array:
+        """Return how the poses depend on the camera, (6 F, 4)."""
+        over_poses = (self._prior.H + reduced.H)[OF_CAMERA:]
+        return -_solved(over_poses[:, OF_CAMERA:], over_poses[:, :OF_CAMERA])
 
     def _newest_by_camera(self, by_camera: Array) -> Array:
         """

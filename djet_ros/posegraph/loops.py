@@ -65,10 +65,8 @@ class EdgeFinder:
         correction: what the odometry had corrected in it.
         """
         number = self._first + len(self._times)
-        gray, left_out = frame.gray, frame.left_out
-        if correction.k1:
-            gray, left_out = undistort_image(gray, correction.camera_matrix(frame.K),
-                                             correction.k1, left_out)
+        gray, left_out = undistort_image(frame.gray, correction.camera_matrix(frame.K),
+                                         correction.k1, frame.left_out)
         features = self._near.features(gray, None if left_out is None else blocked(left_out))
         self._kept[number] = KeyframeImage(frame, features)
         self._time += max(frame.stamp_ns - self._stamp_ns, 0)
@@ -203,7 +201,8 @@ class EdgeFinder:
         own = self._correction(keyframe)
         correction = correction if any(correction) else own
         frame, features = self._kept[keyframe]
-        estimator = TwoViewEstimator(self._wide.config, correction)
+        estimator = (TwoViewEstimator(self._wide.config, correction) if any(correction)
+                     else self._wide)
         return estimator.view(frame.gray, frame.K, features if correction.k1 == own.k1 else None,
                               frame.left_out)
 
