@@ -161,8 +161,8 @@ class RelativePose:
     R: (3, 3) rotation; t: (3,) unit direction, or zeros if the translation is not determined
     (status NO_PARALLAX and all failures). Three statuses come with a best guess whose covariance
     spans the alternatives: AMBIGUOUS if a very different motion explains the matches as well;
-    TWO_MOTIONS if two bodies move and nothing decides which of them is the static world, or if the
-    camera may stand still while one passes;
+    TWO_MOTIONS if two bodies move and nothing decides which of them is the static world, if the
+    camera may stand still while one passes, or if one has come to fill the view;
     TOO_FEW_INLIERS if false matches could produce as many inliers. covariance_5: (5, 5) over
     (rotation vector in rad, arc of t in rad in the basis ``sphere_tangents(t)``);
     covariance_6: (6, 6) over (rotation vector, t), of rank 5 because t has unit length. If t is

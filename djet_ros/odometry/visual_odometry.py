@@ -33,6 +33,7 @@ from djet_ros.odometry.result import camera_motion, OdometryResult
 from djet_ros.odometry.scale import Length, scale_source, ScaleSource
 from djet_ros.odometry.standstill import Standstill
 from djet_ros.odometry.structure import ambiguous, TrackScale
+from djet_ros.odometry.takeover import Takeover
 from djet_ros.odometry.trajectory import Trajectory
 from djet_ros.odometry.uncertainty import (
     motion_covariance,
@@ -125,7 +126,8 @@ class VisualOdometry:
         self._bad_pairs = self._priors.known_ns = 0
         # Whether the last frame moved, and its reference was kept.
         self._waited = False
-        self._standstill, self._trajectory = Standstill(), Trajectory()
+        self._standstill, self._takeover = Standstill(), Takeover()
+        self._trajectory = Trajectory()
 
     @property
     def estimator(self) -> TwoViewEstimator:
@@ -184,7 +186,8 @@ class VisualOdometry:
         if stands and not returned:
             return self._stationary(frame, pair, span)
         # Verify the pair by the landmarks' depths and the gyro, and fuse the gyro's rotation.
-        pair = self._verified(view, pair, priors, span)
+        pair = self._takeover.judged(reference.pair, self._verified(view, pair, priors, span),
+                                     frame.stamp_ns)
         may_stand = self._may_stand(standing or pair, span, at_rest)
         if may_stand and pair.status is Status.OK and not self._has_turned(pair, at_rest):
             pair = ambiguous(pair)
@@ -284,6 +287,7 @@ class VisualOdometry:
             self._priors.known_ns = frame.stamp_ns
         self._refer_to(frame, view, None)
         self._scale.begin(view)
+        self._takeover.forget()
         self._last_pair, self._bad_pairs = None, 0
         return OdometryResult.without_pair(
             frame, status, self._trajectory.pose, self._trajectory.path.pose,
@@ -299,6 +303,7 @@ class VisualOdometry:
                          self._trajectory.stayed(covariance), keyframe=False),
             status=Status.NO_PARALLAX, stationary=True)
         self._standstill.stay(pair, self._config.standstill)
+        self._takeover.stay(pair)
         # What the camera has crept is part of a motion that will be estimated later.
         creeps = self._standstill.creeps(pair, self._config.standstill)
         if not creeps:
@@ -350,6 +355,7 @@ class VisualOdometry:
             self._refer_to(frame, view, pair)
         self._last_pair, self._bad_pairs, self._priors.known_ns = pair, 0, frame.stamp_ns
         self._standstill.take(pair, view.K, self._config.standstill)
+        self._takeover.take(pair)
         if (correction := self._scale.correction_due) is not None:
             self._correct(correction)
         return result
@@ -381,6 +387,7 @@ class VisualOdometry:
         self._priors.refer(frame.stamp_ns)
         self._priors.forget_before(frame.stamp_ns)
         self._standstill.refer()
+        self._takeover.refer()
 
     def _correct(self, correction: Correction) -> None:
         """

@@ -1,0 +1,92 @@
+"""
+Another body that comes to fill the view, such as a lorry that passes close by.
+
+All matches of a pair may then be on it, and fit its motion alone: nothing in the two images tells
+that it is not the static world. But hardly any of them is a point of the world that the camera saw
+before, and they move otherwise. A camera that turns away from all that it saw and goes elsewhere
+would look the same, but hardly does both from one frame to the next.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from djet_ros.core.covariance import UNDETERMINED
+from djet_ros.core.known_depths import same_points
+from djet_ros.core.rivals import MIN_BODY_SHARE
+from djet_ros.core.types import Array, RelativePose, Status, TRACKED, UNDECIDED
+import numpy as np
+
+# rad; chosen: change of its direction up to which a motion goes on.
+_GOES_ON = 0.35
+
+# Nanoseconds; chosen: for so long only a motion that goes on is that of the camera. A lorry that
+# passes at walking pace has left the view by then.
+_DOUBTED_NS = 3_000_000_000
+
+
+class Takeover:
+    """Tells whether pairs follow the world, or what has taken over the view."""
+
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget everything, as it is unknown how the camera has moved."""
+        # Direction in which it last moved, and the stamp up to which others are doubted.
+        self._direction: Array | None = None
+        self._doubted_until_ns: int | None = None
+        # Pixels (M, 2) of the reference frame that stood still after it.
+        self._still: Array | None = None
+
+    def refer(self) -> None:
+        """Take another frame as the reference, in which pairs begin."""
+        self._still = None
+
+    def stay(self, pair: RelativePose) -> None:
+        """Take a pair of a camera that stands still."""
+        self._doubted_until_ns, self._still = None, pair.x[pair.inliers]
+
+    def take(self, pair: RelativePose) -> None:
+        """Take a pair of a camera that moves."""
+        self._doubted_until_ns = None
+        if pair.t.any():
+            self._direction = pair.t
+
+    def judged(self, before: RelativePose | None, pair: RelativePose, stamp_ns: int
+               ) -> RelativePose:
+        """
+        Return a pair, as TWO_MOTIONS if another body has taken over the view.
+
+        before: the pair that ends where it begins; stamp_ns: of its end.
+        """
+        tracked = pair.status in TRACKED
+        if tracked and self._goes_on(pair):
+            return pair
+        doubted = self._doubted_until_ns is not None and stamp_ns < self._doubted_until_ns
+        if not doubted and (tracked or pair.status in UNDECIDED) and pair.t.any():
+            doubted = self._is_of_other_points(before, pair)
+            if doubted:
+                self._doubted_until_ns = stamp_ns + _DOUBTED_NS
+        if tracked and doubted:
+            return replace(pair, status=Status.TWO_MOTIONS, covariance_5=UNDETERMINED[0],
+                           covariance_6=UNDETERMINED[1])
+        return pair
+
+    def _goes_on(self, pair: RelativePose) -> bool:
+        return self._direction is not None and bool(pair.t @ self._direction > np.cos(_GOES_ON))
+
+    def _is_of_other_points(self, before: RelativePose | None, pair: RelativePose) -> bool:
+        """
+        Return whether hardly any inlier of a pair is a point of the world as it was known.
+
+        Of successive pairs a quarter and more were, on streets, indoors and by hand.
+        """
+        known = self._still
+        if known is None:
+            # Without a motion before, nothing tells that this one is another.
+            if self._direction is None or before is None or before.status not in TRACKED:
+                return False
+            known = before.y_opt[before.inliers]
+        near, _ = same_points(pair.x[pair.inliers], known)
+        return bool(near.sum() <= MIN_BODY_SHARE * len(near))
