@@ -1,5 +1,7 @@
 """Another body that takes over the view is not taken for the world."""
 
+from dataclasses import replace
+
 from djet_ros.core.types import RelativePose, Status, TRACKED
 from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
@@ -14,9 +16,9 @@ WORLD, LORRY = (np.random.default_rng(seed).uniform(0, 400, (400, 2)) for seed i
 
 
 def pair(places, t=AHEAD, status=Status.OK):
-    """Return a pair of a motion that leaves its points at the same pixels."""
+    """Return a pair of a motion that leaves its points at the same pixels, known to 0.01 rad."""
     return RelativePose(status, t=t, x=places, y=places, y_opt=places,
-                        inliers=np.ones(len(places), bool))
+                        inliers=np.ones(len(places), bool), covariance_5=1e-4 * np.eye(5))
 
 
 def mixed(share):
@@ -43,6 +45,12 @@ def test_a_motion_that_goes_on_is_believed_whatever_it_sees():
     sideways = AHEAD + 0.3 * ASIDE
     for t in AHEAD, sideways / np.linalg.norm(sideways):
         assert moving().judged(pair(WORLD), pair(LORRY, t), 0).status is Status.OK
+
+
+def test_a_direction_that_is_hardly_known_is_no_other_motion():
+    """As of a hand that turns fast, whose points leave the view."""
+    vague = replace(pair(LORRY, ASIDE), covariance_5=0.5**2 * np.eye(5))
+    assert moving().judged(pair(WORLD), vague, 0).status is Status.OK
 
 
 def test_what_follows_is_doubted_until_the_motion_goes_on_or_for_three_seconds():

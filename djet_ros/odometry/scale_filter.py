@@ -1,8 +1,11 @@
 """
 Kalman filter over the scale of a track: metres per unit, from lengths that a source measures.
 
-The state is the logarithm of that factor. It hardly changes from step to step, so measurements may
-be coarse or missing; without any, the last factor is kept and its variance grows.
+The state is the logarithm of that factor, and that of the camera's usual speed. The factor hardly
+changes from step to step, so measurements may be coarse or missing; without any, the last factor
+is kept and its variance grows. Where landmarks do not hold the scale, the usual speed bounds its
+drift: a camera seldom moves twice as fast as before for long, but without a bound lengths may
+become any number of times too long. Where they hold it, speeds have no weight beside them.
 """
 
 from __future__ import annotations
@@ -30,12 +33,21 @@ _CORRELATION_LENGTHS = 2.0
 # Seconds; chosen: short lengths that are not significant by themselves are summed over this time.
 _SUMMED_OVER = 1.0
 
+# Seconds over which a speed is a mean; chosen: standard deviation of its logarithm from that of
+# the usual speed, and variance that the latter gains in a second: a factor of two in ten seconds.
+# With half that deviation or a third of that gain a scale that drifts does so less, but follows a
+# change of the speed more.
+_SPEED_OVER, _SPEED_SIGMA, _USUAL_CHANGES = 1.0, 1.0, 0.5 / 10
+
+# Standard deviation of a logarithm that is not known.
+_UNKNOWN = 1e3
+
 
 class ScaleFilter:
     """
     Scale of a track.
 
-    log, variance: of the factor's logarithm; metric: whether it is known in metres.
+    metric: whether it is known in metres.
     """
 
     def __init__(self) -> None:
@@ -44,19 +56,21 @@ class ScaleFilter:
 
     def reset(self) -> None:
         """Forget everything."""
-        self.log, self.variance, self.metric = 0.0, 0.0, False
+        # Logarithms of the factor, and of the usual speed in units of that.
+        self._mean, self._covariance = np.zeros(2), np.diag([0.0, _UNKNOWN**2])
+        self.metric = False
         # Outliers in a row: their number and their metres.
         self._outliers = np.zeros(2)
-        # Whether the track ever was metric, and the share of its common errors (factor, source)
-        # that the next length still has.
+        # Whether the track ever was metric; what is left in the errors of the state of that of the
+        # factor of the last length, as a share of it; and of the error of the source.
         self._was_metric = False
-        self._kept: Array = np.ones(2)
+        self._left, self._left_of_source = np.array([1.0, 0.0]), 1.0
         self.restart_sum()
 
     def configure(self, share: float) -> None:
         """Set the standard deviation that all metric lengths have in common, as a share."""
         if share != self._share:
-            self._kept[1] = 0.0
+            self._left_of_source = 0.0
         self._share = share
         self.restart_sum()
 
@@ -64,6 +78,18 @@ class ScaleFilter:
         """Forget the sum of short lengths, as those that follow are not comparable."""
         # Metres, their variance, units, their variance, seconds.
         self._sum = np.zeros(5)
+        # Units, seconds with parallax, all seconds.
+        self._moved = np.zeros(3)
+
+    @property
+    def log(self) -> float:
+        """Return the logarithm of the factor."""
+        return float(self._mean[0])
+
+    @property
+    def variance(self) -> float:
+        """Return its variance."""
+        return float(self._covariance[0, 0])
 
     @property
     def factor(self) -> float:
@@ -72,13 +98,13 @@ class ScaleFilter:
 
     def add_noise(self, variance: float) -> None:
         """Increase the variance of the log factor."""
-        self.variance += variance
+        self._covariance[0, 0] += variance
         self.metric = bool(self.metric and self.variance < _NOT_METRIC**2)
 
     def unit_changed(self, ratio: float) -> None:
         """Take lengths in units of the track that are longer by a ratio than those before."""
-        if self._was_metric:
-            self.log -= float(np.log(ratio))
+        # Without metres lengths become longer, and the usual speed with them.
+        self._mean += [-np.log(ratio), 0.0] if self._was_metric else [0.0, np.log(ratio)]
 
     def scaled(self, units: float, sigma: float, measured: bool) -> Length:
         """
@@ -105,8 +131,11 @@ class ScaleFilter:
         """
         self._was_metric = self._was_metric or metric
         share = self._share if self._was_metric else 0.0
-        common = Common(np.array([variance, share**2]), self._kept)
-        self._kept = np.ones(2)
+        common = Common(np.array([variance, share**2]),
+                        np.array([self._left[0], self._left_of_source]))
+        self._left, self._left_of_source = np.array([1.0, 0.0]), 1.0
+        if self.variance:
+            self._left[1] = self._covariance[1, 0] / self.variance
         return common
 
     def update(self, measured: Length, units: float, sigma: float, seconds: float,
@@ -123,10 +152,29 @@ class ScaleFilter:
             return
         observed, noise, metres = observation
         if exact:
-            self.log, self.variance, self.metric = observed, 0.0, True
-            self._kept[0] = 0.0
+            self._set(observed, 0.0)
         else:
             self._observe(observed, noise, metres, correlation)
+
+    def moved(self, units: float, seconds: float, parallax: bool) -> None:
+        """Take a step of the track: its length, its duration, and whether it is significant."""
+        self._covariance[1, 1] += _USUAL_CHANGES * seconds
+        self._moved += [units, seconds * parallax, seconds]
+        units, significant, seconds = self._moved.tolist()
+        if seconds < _SPEED_OVER:
+            return
+        self._moved = np.zeros(3)
+        if significant > seconds / 2:
+            # The speed in units is the usual one over the factor.
+            self._correct(np.array([-1.0, 1.0]), float(np.log(units / seconds)), _SPEED_SIGMA**2)
+
+    def _correct(self, row: Array, observed: float, noise: float) -> None:
+        """Correct the state by an observation of row @ state (2,), with its variance."""
+        spread = self._covariance @ row
+        gain = spread / (row @ spread + noise)
+        self._mean = self._mean + gain * (observed - row @ self._mean)
+        self._covariance = self._covariance - np.outer(gain, spread)
+        self._left = self._left - gain * (row @ self._left)
 
     def _observation(self, measured: Length, units: float, sigma: float, seconds: float
                      ) -> tuple[float, float, float] | None:
@@ -154,22 +202,28 @@ class ScaleFilter:
     def _observe(self, observed: float, noise: float, metres: float, correlation: float) -> None:
         """Take an observation of the log factor, with its variance, over some metres."""
         if not self.metric:
-            self.log, self.variance, self.metric = observed, noise, True
-            self._kept[0] = 0.0
+            self._set(observed, noise)
             return
         innovation = observed - self.log
         if innovation**2 > _OUTLIER * (self.variance + noise):
             self._outliers += [1, metres]
             if (self._outliers < [_IN_A_ROW, _CORRELATION_LENGTHS * correlation]).any():
                 return
-            self.variance += innovation**2
+            self._covariance[0, 0] += innovation**2
         self._outliers = np.zeros(2)
         # n lengths with one error in common are as sure as one: each has n times the noise.
         noise *= max(correlation / metres, 1.0)
-        gain = self.variance / (self.variance + noise)
-        self.log += gain * innovation
-        self.variance *= 1 - gain
-        self._kept[0] *= 1 - gain
+        self._correct(np.array([1.0, 0.0]), observed, noise)
+
+    def _set(self, log: float, variance: float) -> None:
+        """Set the factor; the usual speed in units of the track stays as known as it was."""
+        in_units = np.array([-1.0, 1.0])
+        speed = float(in_units @ self._mean)
+        spread = float(in_units @ self._covariance @ in_units)
+        self._mean = np.array([log, speed + log])
+        self._covariance = np.full((2, 2), variance) + np.diag([0.0, spread])
+        self._left = np.array([0.0, in_units @ self._left])
+        self.metric = True
 
 
 def _significant(lengths: Array) -> bool:

@@ -201,6 +201,7 @@ class TrackScale:
         if not parallax:
             relative, addition = _by_window(relative, addition, guess)
         sigma = self._wander(addition, seconds, parallax)
+        self._filter.moved(addition.length, seconds, parallax)
         if measured.known:
             self._filter.update(measured, addition.length, sigma, seconds,
                                 self._source.correlation_length, self._source.exact)

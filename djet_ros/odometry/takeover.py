@@ -12,13 +12,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 from djet_ros.core.covariance import UNDETERMINED
+from djet_ros.core.geometry import direction_angle
 from djet_ros.core.known_depths import same_points
 from djet_ros.core.rivals import MIN_BODY_SHARE
 from djet_ros.core.types import Array, RelativePose, Status, TRACKED, UNDECIDED
 import numpy as np
 
-# rad; chosen: change of its direction up to which a motion goes on.
-_GOES_ON = 0.35
+# rad; chosen: change of its direction up to which a motion goes on. Standard deviations of the
+# direction, the usual three, that are no change.
+_GOES_ON, _NO_CHANGE = 0.35, 3.0
 
 # Nanoseconds; chosen: for so long only a motion that goes on is that of the camera. A lorry that
 # passes at walking pace has left the view by then.
@@ -74,7 +76,10 @@ class Takeover:
         return pair
 
     def _goes_on(self, pair: RelativePose) -> bool:
-        return self._direction is not None and bool(pair.t @ self._direction > np.cos(_GOES_ON))
+        if self._direction is None or not pair.t.any():
+            return False
+        sigma = np.sqrt(np.linalg.eigvalsh(pair.covariance_5[3:, 3:])[-1])
+        return bool(direction_angle(pair.t, self._direction) < _GOES_ON + _NO_CHANGE * sigma)
 
     def _is_of_other_points(self, before: RelativePose | None, pair: RelativePose) -> bool:
         """
