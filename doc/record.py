@@ -29,6 +29,7 @@ from tempfile import TemporaryDirectory, TemporaryFile
 from time import monotonic
 from typing import Any, IO
 
+import cv2
 import djet_ros
 from djet_ros.cli.graph_options import stop_by_signal
 from djet_ros.config.flat import from_flat
@@ -38,7 +39,7 @@ from djet_ros.core.types import Array
 from djet_ros.dds.graph import Graph
 from djet_ros.dds.middleware import DdsMiddleware
 from djet_ros.dds.names import Names
-from djet_ros.lab.scenes import render_sequence
+from djet_ros.lab.scenes import make_scene, render_sequence
 from djet_ros.lab.sequences import open_datasets, opened, Selection
 from djet_ros.live.graph_node import PoseGraphNode
 from djet_ros.live.middleware import Profile
@@ -49,6 +50,7 @@ from djet_ros.posegraph.offline import run_slam
 from djet_ros.posegraph.pose_graph import Edge
 from djet_ros.recordings.outputs import write_whole
 from djet_ros.recordings.recording import open_recording
+from djet_ros.recordings.trajectories import KittiWriter
 from djet_ros.replay.alignment import aligned, position_rmse
 from djet_ros.replay.graph_of_results import read_steps
 from djet_ros.replay.ground_truth import GroundTruth
@@ -85,6 +87,8 @@ COVERED = 12
 WITH_LORRIES, LORRIES_PASS_IN = ('moving_object', 'motorway', 'traffic'), 120
 # Frames of a hand-held camera, and how much slower it also moves: as at eighty images a second.
 SLOW_FRAMES, SLOWER = 100, 8
+# Seeds of the drives through crossing traffic.
+CROSSINGS = range(4)
 # Second value of estimator.calibration_sigma for real cameras, in pixels: the standard deviation
 # if it is unknown whether pixel centres are at integers or at halves.
 CALIBRATED = '0.25'
@@ -368,6 +372,10 @@ def coverage(place: Path, args: argparse.Namespace) -> dict[str, Any]:
         djet('lab', 'coverage', '--scenes', scene, '--seeds', '0-4', '--frames', LORRIES_PASS_IN,
              '--output', place / scene)
         rows += covered(place / scene, f'{scene}, {LORRIES_PASS_IN} frames of 5 seeds')
+    drives = crossing_drives(place / 'crossing')
+    djet('lab', 'coverage', *drives, '--output', place / 'crossed')
+    rows += covered(place / 'crossed', f'crossing `traffic`, {len(drives)} drives of '
+                    f'{LORRIES_PASS_IN} frames')
     for real in args.data.glob('tartanair/sequences/*'):
         for sigma, told in (('0', ''), (CALIBRATED, f', calibration sigma {CALIBRATED} px')):
             djet('lab', 'coverage', real, '--calibration-sigma', sigma, '--output',
@@ -379,6 +387,51 @@ def coverage(place: Path, args: argparse.Namespace) -> dict[str, Any]:
                        'rejected (correct)', 'NEES / expected, median', 'inside 95 %',
                        'beyond 99.9 %'],
             'rows': rows}
+
+
+def starting(seconds: Array) -> Array:
+    """Return the metres (N,) driven by a car that stands for two seconds, and accelerates."""
+    return np.asarray(0.5 * np.maximum(seconds - 2, 0)**2)
+
+
+def at_once(seconds: Array) -> Array:
+    """Return those of one that has its speed at once."""
+    return np.asarray(6 * np.maximum(seconds - 2, 0))
+
+
+def stopping(seconds: Array) -> Array:
+    """Return those of one that brakes after a second, stands for four, and starts again."""
+    braking = np.clip(seconds - 1, 0, 8 / 3)
+    return np.asarray(8 * np.minimum(seconds, 1) + 8 * braking - 1.5 * braking**2
+                      + 0.75 * np.maximum(seconds - 8, 0)**2)
+
+
+def crossing_drives(place: Path) -> list[Path]:
+    """Render cars that drive straight ahead through the scene `traffic`, trembling a little."""
+    folders: list[Path] = []
+    seconds = np.linspace(0, 0.1 * (LORRIES_PASS_IN - 1), LORRIES_PASS_IN)
+    (place / 'poses').mkdir(parents=True)
+    for metres, seed in product((starting, at_once, stopping), CROSSINGS):
+        scene, ahead = make_scene('traffic', seed), metres(seconds)
+        moves = np.diff(ahead, prepend=ahead[0])[:, None] > 1e-6
+        turns = np.cumsum(np.random.default_rng(seed).normal(0, np.radians(0.03), (
+            LORRIES_PASS_IN, 3)) * moves, axis=0)
+        folder = place / 'sequences' / f'{len(folders):02d}'
+        (folder / 'image_0').mkdir(parents=True)
+        with KittiWriter(place / 'poses' / f'{folder.name}.txt') as writer:
+            for index, (turn, way) in enumerate(zip(turns, ahead)):
+                pose = np.eye(4)
+                pose[:3, :3], pose[2, 3] = Rotation.from_rotvec(turn).as_matrix(), way
+                cv2.imwrite(str(folder / 'image_0' / f'{index:06d}.png'),
+                            scene.render(pose, index))
+                writer.write(round(seconds[index] * 1e9), pose)
+        projection = np.hstack([scene.K, np.zeros((3, 1))]).ravel()
+        (folder / 'calib.txt').write_text(f'P0: {" ".join(map(repr, projection.tolist()))}\n')
+        (folder / 'times.txt').write_text(''.join(f'{second:.1f}\n' for second in seconds))
+        # As one scene they are one row.
+        (folder / 'scene.txt').write_text('djet render crossing_traffic:\n')
+        folders.append(folder)
+    return folders
 
 
 def covered(folder: Path, name: str = '') -> list[list[str]]:

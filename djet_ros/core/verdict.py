@@ -161,6 +161,12 @@ def with_left_out(relative: RelativePose, pair: Pair, kept: NDArray[np.bool_]) -
         hamming=all_of(relative.hamming, unknown), losses=all_of(relative.losses, unknown))
 
 
+def as_undecided(relative: RelativePose, status: Status = Status.AMBIGUOUS) -> RelativePose:
+    """Return a pair with another status, its covariance unknown: other evidence contradicts it."""
+    return replace(relative, status=status, covariance_5=UNDETERMINED[0],
+                   covariance_6=UNDETERMINED[1])
+
+
 def as_pure_rotation(relative: RelativePose, K: Array) -> RelativePose:
     """
     Return a pair without parallax as a pure rotation (status NO_PARALLAX).

@@ -12,12 +12,12 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from djet_ros.core.correction import Correction
-from djet_ros.core.covariance import lift, UNDETERMINED
+from djet_ros.core.covariance import lift
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import sphere_tangents
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Array, Pose, RelativePose, Status, View
-from djet_ros.core.verdict import as_pure_rotation
+from djet_ros.core.verdict import as_pure_rotation, as_undecided
 from djet_ros.core.window import Window, WindowStep
 from djet_ros.odometry.scale import Length, ScaleSource, unknown
 from djet_ros.odometry.scale_filter import ScaleFilter
@@ -318,7 +318,7 @@ class TrackScale:
         agrees = self.agrees(Pose(relative.R, relative.t), relative.x, relative.y_opt)
         if relative.status is Status.OK:
             if agrees is False:
-                return ambiguous(relative)
+                return as_undecided(relative)
             return as_pure_rotation(relative, K) if self.lacks_parallax(relative) else relative
         if agrees and all(self.agrees(rival.pose, relative.x, relative.y) is False
                           for rival in relative.rivals):
@@ -346,12 +346,6 @@ class TrackScale:
             return False
         length = self._window.pair_length(relative)
         return length is not None and length[0] < _OUT_OF_NOISE * length[1]
-
-
-def ambiguous(relative: RelativePose) -> RelativePose:
-    """Return a pair as AMBIGUOUS, with unknown covariance: other evidence contradicts it."""
-    return replace(relative, status=Status.AMBIGUOUS, covariance_5=UNDETERMINED[0],
-                   covariance_6=UNDETERMINED[1])
 
 
 def _by_window(relative: RelativePose, addition: WindowStep, usual: float

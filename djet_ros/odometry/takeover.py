@@ -9,13 +9,11 @@ would look the same, but hardly does both from one frame to the next.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-from djet_ros.core.covariance import UNDETERMINED
 from djet_ros.core.geometry import direction_angle
 from djet_ros.core.known_depths import same_points
 from djet_ros.core.rivals import MIN_BODY_SHARE
 from djet_ros.core.types import Array, RelativePose, Status, TRACKED, UNDECIDED
+from djet_ros.core.verdict import as_undecided
 import numpy as np
 
 # rad; chosen: change of its direction up to which a motion goes on. Standard deviations of the
@@ -71,8 +69,7 @@ class Takeover:
             if doubted:
                 self._doubted_until_ns = stamp_ns + _DOUBTED_NS
         if tracked and doubted:
-            return replace(pair, status=Status.TWO_MOTIONS, covariance_5=UNDETERMINED[0],
-                           covariance_6=UNDETERMINED[1])
+            return as_undecided(pair, Status.TWO_MOTIONS)
         return pair
 
     def _goes_on(self, pair: RelativePose) -> bool:

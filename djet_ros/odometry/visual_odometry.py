@@ -23,7 +23,7 @@ from djet_ros.core.types import (
     UNDECIDED,
     View,
 )
-from djet_ros.core.verdict import as_decided
+from djet_ros.core.verdict import as_decided, as_undecided
 from djet_ros.odometry.displacement import turns
 from djet_ros.odometry.frame import continuity, Frame, Reference
 from djet_ros.odometry.guess import Guess
@@ -32,7 +32,7 @@ from djet_ros.odometry.priors import MotionPriors, Span
 from djet_ros.odometry.result import camera_motion, OdometryResult
 from djet_ros.odometry.scale import Length, scale_source, ScaleSource
 from djet_ros.odometry.standstill import Standstill
-from djet_ros.odometry.structure import ambiguous, TrackScale
+from djet_ros.odometry.structure import TrackScale
 from djet_ros.odometry.takeover import Takeover
 from djet_ros.odometry.trajectory import Trajectory
 from djet_ros.odometry.uncertainty import (
@@ -190,7 +190,7 @@ class VisualOdometry:
                                      frame.stamp_ns)
         may_stand = self._may_stand(standing or pair, span, at_rest)
         if may_stand and pair.status is Status.OK and not self._has_turned(pair, at_rest):
-            pair = ambiguous(pair)
+            pair = as_undecided(pair)
         if pair.status not in TRACKED:
             return self._lost(frame, view, pair, span, may_stand and self._standstill.stood)
         # Estimate the length of its translation, and integrate it.
