@@ -51,6 +51,10 @@ def test_a_direction_that_is_hardly_known_is_no_other_motion():
     """As of a hand that turns fast, whose points leave the view."""
     vague = replace(pair(LORRY, ASIDE), covariance_5=0.5**2 * np.eye(5))
     assert moving().judged(pair(WORLD), vague, 0).status is Status.OK
+    # Nor does it end the doubt about another one.
+    takeover = moving()
+    assert takeover.judged(pair(WORLD), pair(LORRY, ASIDE), 0).status is Status.TWO_MOTIONS
+    assert takeover.judged(pair(LORRY), vague, SECOND_NS).status is Status.TWO_MOTIONS
 
 
 def test_what_follows_is_doubted_until_the_motion_goes_on_or_for_three_seconds():
@@ -94,7 +98,7 @@ def test_a_lorry_that_fills_the_view_of_a_driving_car_is_not_followed():
         pose = start.copy()
         pose[:3, 3] += start[:3, :3] @ [0, 0, 0.3 * (index - 90)]
         results.append(odometry.process(
-            Frame(scene.render(pose, index), scene.K, index * 10**8)))
+            Frame(scene.render(pose, index), scene.K, 10**9 + index * 10**8)))
     assert Status.TWO_MOTIONS in [result.status for result in results]
     for result in results:
         aside, _, ahead = result.motion[:3, 3]

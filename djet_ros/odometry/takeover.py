@@ -61,22 +61,22 @@ class Takeover:
         before: the pair that ends where it begins; stamp_ns: of its end.
         """
         tracked = pair.status in TRACKED
-        if tracked and self._goes_on(pair):
+        change = self._change(pair)
+        if tracked and change < _GOES_ON:
             return pair
         doubted = self._doubted_until_ns is not None and stamp_ns < self._doubted_until_ns
-        if not doubted and (tracked or pair.status in UNDECIDED) and pair.t.any():
+        if not doubted and pair.t.any() and (
+                pair.status in UNDECIDED or (tracked and change > _GOES_ON + _uncertainty(pair))):
             doubted = self._is_of_other_points(before, pair)
             if doubted:
                 self._doubted_until_ns = stamp_ns + _DOUBTED_NS
-        if tracked and doubted:
-            return as_undecided(pair, Status.TWO_MOTIONS)
-        return pair
+        return as_undecided(pair, Status.TWO_MOTIONS) if tracked and doubted else pair
 
-    def _goes_on(self, pair: RelativePose) -> bool:
+    def _change(self, pair: RelativePose) -> float:
+        """Return the angle between the directions of a motion and of the last; pi if unknown."""
         if self._direction is None or not pair.t.any():
-            return False
-        sigma = np.sqrt(np.linalg.eigvalsh(pair.covariance_5[3:, 3:])[-1])
-        return bool(direction_angle(pair.t, self._direction) < _GOES_ON + _NO_CHANGE * sigma)
+            return float(np.pi)
+        return direction_angle(pair.t, self._direction)
 
     def _is_of_other_points(self, before: RelativePose | None, pair: RelativePose) -> bool:
         """
@@ -92,3 +92,8 @@ class Takeover:
             known = before.y_opt[before.inliers]
         near, _ = same_points(pair.x[pair.inliers], known)
         return bool(near.sum() <= MIN_BODY_SHARE * len(near))
+
+
+def _uncertainty(pair: RelativePose) -> float:
+    """Return what may be no change of the direction of a motion, in rad."""
+    return float(_NO_CHANGE * np.sqrt(np.linalg.eigvalsh(pair.covariance_5[3:, 3:])[-1]))
