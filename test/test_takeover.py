@@ -29,7 +29,7 @@ def mixed(share):
 
 def moving():
     takeover = Takeover()
-    takeover.take(pair(WORLD))
+    takeover.take(pair(WORLD), 0)
     return takeover
 
 
@@ -51,10 +51,13 @@ def test_a_direction_that_is_hardly_known_is_no_other_motion():
     """As of a hand that turns fast, whose points leave the view."""
     vague = replace(pair(LORRY, ASIDE), covariance_5=0.5**2 * np.eye(5))
     assert moving().judged(pair(WORLD), vague, 0).status is Status.OK
-    # Nor does it end the doubt about another one.
+    # But it does not end the doubt about others.
     takeover = moving()
     assert takeover.judged(pair(WORLD), pair(LORRY, ASIDE), 0).status is Status.TWO_MOTIONS
-    assert takeover.judged(pair(LORRY), vague, SECOND_NS).status is Status.TWO_MOTIONS
+    assert takeover.judged(pair(LORRY), vague, SECOND_NS).status is Status.OK
+    takeover.take(vague, SECOND_NS)
+    later = takeover.judged(vague, pair(LORRY, ASIDE), 2 * SECOND_NS)
+    assert later.status is Status.TWO_MOTIONS
 
 
 def test_what_follows_is_doubted_until_the_motion_goes_on_or_for_three_seconds():

@@ -47,8 +47,10 @@ class Takeover:
         """Take a pair of a camera that stands still."""
         self._doubted_until_ns, self._still = None, pair.x[pair.inliers]
 
-    def take(self, pair: RelativePose) -> None:
-        """Take a pair of a camera that moves."""
+    def take(self, pair: RelativePose, stamp_ns: int) -> None:
+        """Take a tracked pair; while others are doubted, a vague one tells nothing."""
+        if self._doubts(stamp_ns) and self._change(pair) > _GOES_ON:
+            return
         self._doubted_until_ns = None
         if pair.t.any():
             self._direction = pair.t
@@ -61,19 +63,20 @@ class Takeover:
         before: the pair that ends where it begins; stamp_ns: of its end.
         """
         tracked = pair.status in TRACKED
-        change = self._change(pair)
-        if tracked and change < _GOES_ON:
+        if tracked and self._change(pair) < _GOES_ON + _uncertainty(pair):
             return pair
-        doubted = self._doubted_until_ns is not None and stamp_ns < self._doubted_until_ns
-        if not doubted and pair.t.any() and (
-                pair.status in UNDECIDED or (tracked and change > _GOES_ON + _uncertainty(pair))):
+        doubted = self._doubts(stamp_ns)
+        if not doubted and (tracked or pair.status in UNDECIDED) and pair.t.any():
             doubted = self._is_of_other_points(before, pair)
             if doubted:
                 self._doubted_until_ns = stamp_ns + _DOUBTED_NS
         return as_undecided(pair, Status.TWO_MOTIONS) if tracked and doubted else pair
 
+    def _doubts(self, stamp_ns: int) -> bool:
+        return self._doubted_until_ns is not None and stamp_ns < self._doubted_until_ns
+
     def _change(self, pair: RelativePose) -> float:
-        """Return the angle between the directions of a motion and of the last; pi if unknown."""
+        """Return the angle between the directions of a motion and the last one; pi if unknown."""
         if self._direction is None or not pair.t.any():
             return float(np.pi)
         return direction_angle(pair.t, self._direction)
@@ -95,5 +98,7 @@ class Takeover:
 
 
 def _uncertainty(pair: RelativePose) -> float:
-    """Return what may be no change of the direction of a motion, in rad."""
+    """Return the change of direction that may be none, in rad."""
+    if not pair.t.any():
+        return 0.0
     return float(_NO_CHANGE * np.sqrt(np.linalg.eigvalsh(pair.covariance_5[3:, 3:])[-1]))

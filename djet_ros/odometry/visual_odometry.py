@@ -355,7 +355,7 @@ class VisualOdometry:
             self._refer_to(frame, view, pair)
         self._last_pair, self._bad_pairs, self._priors.known_ns = pair, 0, frame.stamp_ns
         self._standstill.take(pair, view.K, self._config.standstill)
-        self._takeover.take(pair)
+        self._takeover.take(pair, frame.stamp_ns)
         if (correction := self._scale.correction_due) is not None:
             self._correct(correction)
         return result
