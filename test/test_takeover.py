@@ -105,4 +105,6 @@ def test_a_lorry_that_fills_the_view_of_a_driving_car_is_not_followed():
     assert Status.TWO_MOTIONS in [result.status for result in results]
     for result in results:
         aside, _, ahead = result.motion[:3, 3]
-        assert result.status not in TRACKED or abs(aside) < 0.1 * ahead
+        if result.status in TRACKED and abs(aside) > 0.1 * ahead:
+            # As both fill the view a pair may be vague, and says so.
+            assert np.linalg.eigvalsh(result.relative.covariance_5[3:, 3:])[-1] > 0.1**2
