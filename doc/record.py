@@ -29,7 +29,6 @@ from tempfile import TemporaryDirectory, TemporaryFile
 from time import monotonic
 from typing import Any, IO
 
-import cv2
 import djet_ros
 from djet_ros.cli.graph_options import stop_by_signal
 from djet_ros.config.flat import from_flat
@@ -40,6 +39,7 @@ from djet_ros.dds.graph import Graph
 from djet_ros.dds.middleware import DdsMiddleware
 from djet_ros.dds.names import Names
 from djet_ros.lab.scenes import make_scene, render_sequence
+from djet_ros.lab.scenes.sequence import FRAME_PERIOD, render_poses
 from djet_ros.lab.sequences import open_datasets, opened, Selection
 from djet_ros.live.graph_node import PoseGraphNode
 from djet_ros.live.middleware import Profile
@@ -50,7 +50,6 @@ from djet_ros.posegraph.offline import run_slam
 from djet_ros.posegraph.pose_graph import Edge
 from djet_ros.recordings.outputs import write_whole
 from djet_ros.recordings.recording import open_recording
-from djet_ros.recordings.trajectories import KittiWriter
 from djet_ros.replay.alignment import aligned, position_rmse
 from djet_ros.replay.graph_of_results import read_steps
 from djet_ros.replay.ground_truth import GroundTruth
@@ -409,28 +408,16 @@ def stopping(seconds: Array) -> Array:
 def crossing_drives(place: Path) -> list[Path]:
     """Render cars that drive straight ahead through the scene `traffic`, trembling a little."""
     folders: list[Path] = []
-    seconds = np.linspace(0, 0.1 * (LORRIES_PASS_IN - 1), LORRIES_PASS_IN)
-    (place / 'poses').mkdir(parents=True)
+    seconds = np.linspace(0, FRAME_PERIOD * (LORRIES_PASS_IN - 1), LORRIES_PASS_IN)
     for metres, seed in product((starting, at_once, stopping), CROSSINGS):
-        scene, ahead = make_scene('traffic', seed), metres(seconds)
+        ahead = metres(seconds)
         moves = np.diff(ahead, prepend=ahead[0])[:, None] > 1e-6
         turns = np.cumsum(np.random.default_rng(seed).normal(0, np.radians(0.03), (
             LORRIES_PASS_IN, 3)) * moves, axis=0)
-        folder = place / 'sequences' / f'{len(folders):02d}'
-        (folder / 'image_0').mkdir(parents=True)
-        with KittiWriter(place / 'poses' / f'{folder.name}.txt') as writer:
-            for index, (turn, way) in enumerate(zip(turns, ahead)):
-                pose = np.eye(4)
-                pose[:3, :3], pose[2, 3] = Rotation.from_rotvec(turn).as_matrix(), way
-                cv2.imwrite(str(folder / 'image_0' / f'{index:06d}.png'),
-                            scene.render(pose, index))
-                writer.write(round(seconds[index] * 1e9), pose)
-        projection = np.hstack([scene.K, np.zeros((3, 1))]).ravel()
-        (folder / 'calib.txt').write_text(f'P0: {" ".join(map(repr, projection.tolist()))}\n')
-        (folder / 'times.txt').write_text(''.join(f'{second:.1f}\n' for second in seconds))
-        # As one scene they are one row.
-        (folder / 'scene.txt').write_text('djet render crossing_traffic:\n')
-        folders.append(folder)
+        poses = np.tile(np.eye(4), (LORRIES_PASS_IN, 1, 1))
+        poses[:, :3, :3], poses[:, 2, 3] = Rotation.from_rotvec(turns).as_matrix(), ahead
+        folders.append(render_poses(make_scene('traffic', seed), poses, place, len(folders),
+                                    'djet render crossing_traffic:'))
     return folders
 
 

@@ -975,20 +975,18 @@ def test_of_the_error_of_a_factor_that_two_lengths_correct_less_is_kept():
         assert scale.scaled(2.0, 0.0, True).common.kept[0] == pytest.approx(kept)
 
 
-def wandered(rng, seconds, per_second, speeds=1.0):
+def wandered(rng, seconds):
     """
-    Move at a speed of about one, seen in a unit that wanders; return errors and what is claimed.
+    Move at a speed of about one, seen in a unit that wanders by a factor of e in a second.
 
-    per_second: standard deviation of the unit's logarithm; speeds: that of the logarithm of the
-    speed over a second, of which nothing is seen in the unit. Returns errors of the log factor,
-    variances and kept shares (3, N).
+    Returns errors of the log factor, variances and kept shares (3, N).
     """
     scale, factor, usual, found = ScaleFilter(), 0.0, 0.0, []
     for _ in range(seconds):
         usual += rng.normal(0, np.sqrt(0.05))
-        factor += rng.normal(0, per_second)
-        scale.add_noise(per_second**2)
-        scale.moved(float(np.exp(usual + rng.normal(0, speeds) - factor)), 1.0, True)
+        factor += rng.normal(0, 1.0)
+        scale.add_noise(1.0)
+        scale.moved(float(np.exp(usual + rng.normal(0, 1.0) - factor)), 1.0, True)
         kept = scale.scaled(1.0, 0.0, False).common.kept[0]
         found.append((scale.log - factor, scale.variance, kept))
     return np.array(found).T
@@ -997,7 +995,7 @@ def wandered(rng, seconds, per_second, speeds=1.0):
 def test_where_landmarks_lose_the_scale_the_usual_speed_bounds_its_drift():
     """By itself it would drift by 1.0 times the root of the number of seconds."""
     rng = np.random.default_rng(0)
-    runs = np.array([wandered(rng, 60, 1.0) for _ in range(200)])
+    runs = np.array([wandered(rng, 60) for _ in range(200)])
     errors, variances, kept = runs[:, 0], runs[0, 1], runs[0, 2]
     assert np.std(errors[:, -1]) < 0.5 * np.sqrt(60)
     assert (errors**2).mean(0) == pytest.approx(variances, rel=0.3)
@@ -1019,19 +1017,19 @@ def test_where_landmarks_hold_the_scale_no_speed_changes_it():
 
 def test_steps_of_a_second_are_one_speed_and_without_parallax_none():
     """Lengths of less than a second are hardly more than noise, as those without parallax are."""
-    for parallax, pulled in (True, True), (False, False):
+    for parallax in True, False:
         scale = ScaleFilter()
         for number in range(96):
             scale.add_noise(0.1)
             # The unit has become a third of what it was.
             scale.moved(0.1 if number < 32 else 0.3, 1 / 32, parallax or number < 32)
-            assert (abs(scale.log) > 1e-3) is (pulled and number >= 63)
-        assert -np.log(3) < scale.log < -0.3 or not pulled
+            assert (abs(scale.log) > 1e-3) is (parallax and number >= 63)
+        assert -np.log(3) < scale.log < -0.3 or not parallax
 
 
 def test_the_usual_speed_is_the_same_in_metres_and_in_another_unit():
     """With the first length in metres, and with a correction that makes all of them longer."""
-    expected = {}
+    found = {}
     for change in 'metres', 'unit', 'nothing':
         scale, units = ScaleFilter(), 2.0
         for second in range(60):
@@ -1043,8 +1041,8 @@ def test_the_usual_speed_is_the_same_in_metres_and_in_another_unit():
                 units *= 1.5
             scale.add_noise(0.04)
             scale.moved(units, 1.0, True)
-        expected[change] = scale.factor
-    assert expected == pytest.approx({'metres': 3.0, 'unit': 1.0, 'nothing': 1.0}, rel=1e-4)
+        found[change] = scale.factor
+    assert found == pytest.approx({'metres': 3.0, 'unit': 1.0, 'nothing': 1.0}, rel=1e-4)
 
 
 def crept(scale, steps, units, hertz=30):

@@ -5,6 +5,7 @@ from dataclasses import replace
 from djet_ros.core.types import RelativePose, Status, TRACKED
 from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.standstill import Standstill
 from djet_ros.odometry.takeover import Takeover
 from djet_ros.odometry.visual_odometry import VisualOdometry
 import numpy as np
@@ -28,7 +29,7 @@ def mixed(share):
 
 
 def moving():
-    takeover = Takeover()
+    takeover = Takeover(Standstill())
     takeover.take(pair(WORLD), 0)
     return takeover
 
@@ -79,13 +80,15 @@ def test_a_bad_pair_of_other_points_lets_the_next_be_doubted():
 
 def test_after_a_standstill_only_points_that_stood_still_move_with_the_world():
     for seen, status in (WORLD, Status.OK), (LORRY, Status.TWO_MOTIONS):
-        takeover = Takeover()
-        takeover.stay(pair(WORLD, np.zeros(3), Status.NO_PARALLAX))
+        standstill = Standstill()
+        takeover = Takeover(standstill)
+        standstill.stay(pair(WORLD, np.zeros(3), Status.NO_PARALLAX), 1.0)
+        takeover.stay()
         assert takeover.judged(None, pair(seen, ASIDE), 0).status is status
 
 
 def test_without_a_motion_before_nothing_is_doubted():
-    takeover = Takeover()
+    takeover = Takeover(Standstill())
     assert takeover.judged(None, pair(LORRY, ASIDE), 0).status is Status.OK
     assert takeover.judged(pair(WORLD), pair(LORRY, ASIDE), 0).status is Status.OK
     takeover = moving()

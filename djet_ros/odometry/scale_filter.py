@@ -42,6 +42,10 @@ _SPEED_OVER, _SPEED_SIGMA, _USUAL_CHANGES = 1.0, 1.0, 0.5 / 10
 # Standard deviation of a logarithm that is not known.
 _UNKNOWN = 1e3
 
+# The factor, and the speed in units of the track, as sums over the state: a speed in units is the
+# usual one over the factor.
+_FACTOR, _SPEED_IN_UNITS = np.array([1.0, 0.0]), np.array([-1.0, 1.0])
+
 
 class ScaleFilter:
     """
@@ -64,7 +68,7 @@ class ScaleFilter:
         # Whether the track ever was metric; what is left in the errors of the state of that of the
         # factor of the last length, as a share of it; and of the error of the source.
         self._was_metric = False
-        self._left, self._left_of_source = np.array([1.0, 0.0]), 1.0
+        self._left, self._left_of_source = _FACTOR, 1.0
         self.restart_sum()
 
     def configure(self, share: float) -> None:
@@ -133,9 +137,8 @@ class ScaleFilter:
         share = self._share if self._was_metric else 0.0
         common = Common(np.array([variance, share**2]),
                         np.array([self._left[0], self._left_of_source]))
-        self._left, self._left_of_source = np.array([1.0, 0.0]), 1.0
-        if self.variance:
-            self._left[1] = self._covariance[1, 0] / self.variance
+        self._left = self._covariance[:, 0] / self.variance if self.variance else _FACTOR
+        self._left_of_source = 1.0
         return common
 
     def update(self, measured: Length, units: float, sigma: float, seconds: float,
@@ -165,8 +168,7 @@ class ScaleFilter:
             return
         self._moved = np.zeros(3)
         if significant > seconds / 2:
-            # The speed in units is the usual one over the factor.
-            self._correct(np.array([-1.0, 1.0]), float(np.log(units / seconds)), _SPEED_SIGMA**2)
+            self._correct(_SPEED_IN_UNITS, float(np.log(units / seconds)), _SPEED_SIGMA**2)
 
     def _correct(self, row: Array, observed: float, noise: float) -> None:
         """Correct the state by an observation of row @ state (2,), with its variance."""
@@ -213,16 +215,15 @@ class ScaleFilter:
         self._outliers = np.zeros(2)
         # n lengths with one error in common are as sure as one: each has n times the noise.
         noise *= max(correlation / metres, 1.0)
-        self._correct(np.array([1.0, 0.0]), observed, noise)
+        self._correct(_FACTOR, observed, noise)
 
     def _set(self, log: float, variance: float) -> None:
         """Set the factor; the usual speed in units of the track stays as known as it was."""
-        in_units = np.array([-1.0, 1.0])
-        speed = float(in_units @ self._mean)
-        spread = float(in_units @ self._covariance @ in_units)
+        speed = _SPEED_IN_UNITS @ self._mean
+        spread = _SPEED_IN_UNITS @ self._covariance @ _SPEED_IN_UNITS
         self._mean = np.array([log, speed + log])
         self._covariance = np.full((2, 2), variance) + np.diag([0.0, spread])
-        self._left = np.array([0.0, in_units @ self._left])
+        self._left = np.array([0.0, _SPEED_IN_UNITS @ self._left])
         self.metric = True
 
 

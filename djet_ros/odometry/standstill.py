@@ -125,10 +125,10 @@ class Standstill:
 
     def is_of_others(self, relative: RelativePose) -> bool:
         """Return whether a pair has the motion of something else than the features that stood."""
-        static = self._is_static(relative.x[relative.inliers])
+        static = self.is_static(relative.x[relative.inliers])
         return self.stood and bool(static.sum() < _LEAST_STILL)
 
-    def _is_static(self, x: Array) -> NDArray[np.bool_]:
+    def is_static(self, x: Array) -> NDArray[np.bool_]:
         """Return which pixels (N, 2) of the reference view are of features that stood."""
         return np.isin(identifiers(x), self._static)
 
@@ -156,7 +156,7 @@ class Standstill:
 
         A car that waits in traffic vibrates, unless a gyro is at rest.
         """
-        static = matches.among(self._is_static(matches.x))
+        static = matches.among(self.is_static(matches.x))
         vibrates = not at_rest and matches.near.sum() < len(matches.x) / 2
         return static.without_drift() if vibrates else static
 

@@ -14,21 +14,27 @@ from djet_ros.core.known_depths import same_points
 from djet_ros.core.rivals import MIN_BODY_SHARE
 from djet_ros.core.types import Array, RelativePose, Status, TRACKED, UNDECIDED
 from djet_ros.core.verdict import as_undecided
+from djet_ros.odometry.standstill import Standstill
 import numpy as np
 
 # rad; chosen: change of its direction up to which a motion goes on. Standard deviations of the
 # direction, the usual three, that are no change.
 _GOES_ON, _NO_CHANGE = 0.35, 3.0
 
-# Nanoseconds; chosen: for so long only a motion that goes on is that of the camera. A lorry that
-# passes at walking pace has left the view by then.
-_DOUBTED_NS = 3_000_000_000
+# Nanoseconds; chosen: for so long a motion is doubted that may be that of a lorry. One that passes
+# at walking pace has left the view by then.
+PASSING_NS = 3_000_000_000
 
 
 class Takeover:
-    """Tells whether pairs follow the world, or what has taken over the view."""
+    """
+    Tells whether pairs follow the world, or what has taken over the view.
 
-    def __init__(self) -> None:
+    standstill: knows which features of the reference view stood still.
+    """
+
+    def __init__(self, standstill: Standstill) -> None:
+        self._standstill = standstill
         self.forget()
 
     def forget(self) -> None:
@@ -36,16 +42,10 @@ class Takeover:
         # Direction in which it last moved, and the stamp up to which others are doubted.
         self._direction: Array | None = None
         self._doubted_until_ns: int | None = None
-        # Pixels (M, 2) of the reference frame that stood still after it.
-        self._still: Array | None = None
 
-    def refer(self) -> None:
-        """Take another frame as the reference, in which pairs begin."""
-        self._still = None
-
-    def stay(self, pair: RelativePose) -> None:
-        """Take a pair of a camera that stands still."""
-        self._doubted_until_ns, self._still = None, pair.x[pair.inliers]
+    def stay(self) -> None:
+        """Note that the camera stands still."""
+        self._doubted_until_ns = None
 
     def take(self, pair: RelativePose, stamp_ns: int) -> None:
         """Take a tracked pair; while others are doubted, a vague one tells nothing."""
@@ -69,7 +69,7 @@ class Takeover:
         if not doubted and (tracked or pair.status in UNDECIDED) and pair.t.any():
             doubted = self._is_of_other_points(before, pair)
             if doubted:
-                self._doubted_until_ns = stamp_ns + _DOUBTED_NS
+                self._doubted_until_ns = stamp_ns + PASSING_NS
         return as_undecided(pair, Status.TWO_MOTIONS) if tracked and doubted else pair
 
     def _doubts(self, stamp_ns: int) -> bool:
@@ -87,14 +87,15 @@ class Takeover:
 
         Of successive pairs a quarter and more were, on streets, indoors and by hand.
         """
-        known = self._still
-        if known is None:
-            # Without a motion before, nothing tells that this one is another.
-            if self._direction is None or before is None or before.status not in TRACKED:
-                return False
-            known = before.y_opt[before.inliers]
-        near, _ = same_points(pair.x[pair.inliers], known)
-        return bool(near.sum() <= MIN_BODY_SHARE * len(near))
+        x = pair.x[pair.inliers]
+        if self._standstill.stood:
+            known = self._standstill.is_static(x)
+        # Without a motion before, nothing tells that this one is another.
+        elif self._direction is None or before is None or before.status not in TRACKED:
+            return False
+        else:
+            known, _ = same_points(x, before.y_opt[before.inliers])
+        return bool(known.sum() <= MIN_BODY_SHARE * len(known))
 
 
 def _uncertainty(pair: RelativePose) -> float:

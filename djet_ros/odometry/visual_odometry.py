@@ -33,7 +33,7 @@ from djet_ros.odometry.result import camera_motion, OdometryResult
 from djet_ros.odometry.scale import Length, scale_source, ScaleSource
 from djet_ros.odometry.standstill import Standstill
 from djet_ros.odometry.structure import TrackScale
-from djet_ros.odometry.takeover import Takeover
+from djet_ros.odometry.takeover import PASSING_NS, Takeover
 from djet_ros.odometry.trajectory import Trajectory
 from djet_ros.odometry.uncertainty import (
     motion_covariance,
@@ -52,10 +52,6 @@ _LONGEST_CREEP_NS = 2_000_000_000
 # Nanoseconds; chosen: for so long a reference is kept for a longer step of a track. A camera that
 # stops after a short one would not be seen to stand.
 _LONGEST_WAIT_NS = 2_000_000_000
-
-# Nanoseconds; chosen: for so long a start of motion that the gyro does not measure is doubted. A
-# lorry that passes at walking pace has left the image by then.
-_UNMEASURED_START_NS = 3_000_000_000
 
 
 class VisualOdometry:
@@ -126,8 +122,8 @@ class VisualOdometry:
         self._bad_pairs = self._priors.known_ns = 0
         # Whether the last frame moved, and its reference was kept.
         self._waited = False
-        self._standstill, self._takeover = Standstill(), Takeover()
-        self._trajectory = Trajectory()
+        self._standstill, self._trajectory = Standstill(), Trajectory()
+        self._takeover = Takeover(self._standstill)
 
     @property
     def estimator(self) -> TwoViewEstimator:
@@ -257,7 +253,7 @@ class VisualOdometry:
 
         standing: the pair as of a camera that stands, with all matches that stay in place.
         """
-        return (span[1] - self._priors.known_ns < _UNMEASURED_START_NS
+        return (span[1] - self._priors.known_ns < PASSING_NS
                 and self._standstill.is_likely(standing, self._config.standstill, at_rest,
                                                self._horizon))
 
@@ -303,7 +299,7 @@ class VisualOdometry:
                          self._trajectory.stayed(covariance), keyframe=False),
             status=Status.NO_PARALLAX, stationary=True)
         self._standstill.stay(pair, self._config.standstill)
-        self._takeover.stay(pair)
+        self._takeover.stay()
         # What the camera has crept is part of a motion that will be estimated later.
         creeps = self._standstill.creeps(pair, self._config.standstill)
         if not creeps:
@@ -387,7 +383,6 @@ class VisualOdometry:
         self._priors.refer(frame.stamp_ns)
         self._priors.forget_before(frame.stamp_ns)
         self._standstill.refer()
-        self._takeover.refer()
 
     def _correct(self, correction: Correction) -> None:
         """

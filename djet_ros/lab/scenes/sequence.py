@@ -11,6 +11,7 @@ from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.lab.scenes.catalogue import find, make_scene, suggested_frames
 from djet_ros.lab.scenes.imu import feel, FeltMotion, Mems, TO_CAMERA
+from djet_ros.lab.scenes.scene import Scene
 from djet_ros.recordings.trajectories import KittiWriter
 import numpy as np
 from numpy.typing import NDArray
@@ -36,15 +37,28 @@ def render_sequence(name: str, out: Path, frames: int | None = None, seed: int =
     DjetError if it exists, unless ``overwrite``, or can't be written. Times and poses are written
     last, so that an interrupted rendering is not mistaken for a complete one.
     """
-    scene, number = make_scene(name, seed, size, slower), find(name).number
+    scene = make_scene(name, seed, size, slower)
     poses = scene.trajectory(frames if frames is not None else suggested_frames(scene))
+    label = (f'djet render {name}: seed {seed}, {len(poses)} frames, '
+             f'{scene.size[0]}x{scene.size[1]}, 1/{slower} of the usual speed')
+    return render_poses(scene, poses, out, find(name).number, label, progress,
+                        overwrite=overwrite, mems=mems)
+
+
+def render_poses(scene: Scene, poses: Array, out: Path, number: int, label: str,
+                 progress: Callable[[int, int], None] | None = None, *,
+                 overwrite: bool = False, mems: Mems | None = None) -> Path:
+    """
+    Render a scene from poses (N, 4, 4), camera to first camera, a frame period apart.
+
+    number: of the sequence; label: describes it, 'djet render NAME: ...', where sequences with one
+    name are one scene to `djet lab coverage`. All else as for ``render_sequence``.
+    """
     folder = out / 'sequences' / f'{number:02d}'
     truth = out / 'poses' / f'{number:02d}.txt'
     try:
         _clear(folder, truth, overwrite)
-        (folder / _LABEL).write_text(f'djet render {name}: seed {seed}, {len(poses)} frames, '
-                                     f'{scene.size[0]}x{scene.size[1]}, 1/{slower} of the '
-                                     'usual speed\n', 'utf-8')
+        (folder / _LABEL).write_text(f'{label}\n', 'utf-8')
         (folder / 'calib.txt').write_text(
             f'P0: {_projection(scene.K)}\nTr_imu_to_cam: {_projection(TO_CAMERA)}\n',
             'utf-8')
@@ -54,7 +68,7 @@ def render_sequence(name: str, out: Path, frames: int | None = None, seed: int =
             if progress is not None:
                 progress(index + 1, len(poses))
         if len(poses) > 2:
-            _write_imu(folder / _IMU, feel(poses, FRAME_PERIOD, mems or Mems(), seed,
+            _write_imu(folder / _IMU, feel(poses, FRAME_PERIOD, mems or Mems(), scene.seed,
                                            scene.level))
         (folder / 'times.txt').write_text(''.join(f'{i * FRAME_PERIOD:.6e}\n'
                                                   for i in range(len(poses))),
