@@ -18,11 +18,15 @@ from djet_ros.lab.coverage import (
     Coverage,
     coverage_rows,
     draw_reliability,
+    IN_A_ROW,
     LEVELS,
     normalised_square,
     share_with_bounds,
 )
+from djet_ros.lab.scenes import render_sequence
 from djet_ros.odometry.result import camera_motion
+from djet_ros.odometry.visual_odometry import VisualOdometry
+from djet_ros.recordings.datasets import open_sequence
 import numpy as np
 import pytest
 from scipy.stats import binom
@@ -182,6 +186,23 @@ def test_the_command_renders_measures_and_resumes(tmp_path: Path) -> None:
     assert djet(*command).stdout == answer.stdout
     assert (tmp_path / 'records.jsonl').read_bytes() == records
     assert image.stat().st_mtime_ns == before
+
+
+def test_in_a_row_a_sequence_is_measured_as_the_odometry_sees_it(tmp_path: Path) -> None:
+    # Longer than what is estimated together of independent pairs.
+    render_sequence('moving_object', tmp_path / 'scene', 24, 0, (320, 96))
+    source = next(tmp_path.glob('scene/sequences/*'))
+    answer = djet(source, '--output', tmp_path / 'found', '--workers', 1)
+    assert answer.returncode == 0, answer.stderr
+    chunks = map(json.loads, (tmp_path / 'found' / 'records.jsonl').read_text().splitlines())
+    found = [one for chunk in chunks for one in chunk.get('records', ())
+             if one['start'] == IN_A_ROW]
+    assert [one['current'] for one in found] == list(range(1, 24))
+    odometry, sequence = VisualOdometry(), open_sequence(source)
+    assert sequence is not None
+    expected = [odometry.process(sequence.frame(index)).relative for index in range(24)][1:]
+    assert [(one['status'], one['inliers']) for one in found] == [
+        (pair.status.value, pair.inliers.sum()) for pair in expected if pair is not None]
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [

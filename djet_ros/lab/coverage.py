@@ -20,6 +20,7 @@ from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import unit
 from djet_ros.core.types import Array, RelativePose, Status, TRACKED
 from djet_ros.lab.pairs import has_failed, PairChunk
+from djet_ros.lab.runner import chunks_of
 from djet_ros.lab.scenes.sequence import rendered_scene
 from djet_ros.lab.sequences import Dataset, opened, plain_name
 from djet_ros.odometry.result import camera_motion
@@ -38,10 +39,8 @@ SURE_ROTATION, SURE_DIRECTION = 0.3, 3.0
 # How pairs are started: each by itself, or in the odometry, with the previous motion as prior.
 ALONE, IN_A_ROW = 'alone', 'in a row'
 
-# Pairs that the odometry processes before those of a chunk, to initialise.
-_LEAD = 3
-
-PAIRS_PER_CHUNK = 20
+# Independent pairs that are estimated together.
+_PAIRS_PER_CHUNK = 20
 
 
 @dataclass(frozen=True)
@@ -130,10 +129,40 @@ class CoverageRow:
     inside: tuple[tuple[float, float, float], ...]
 
 
-def cover_chunk(chunk: PairChunk, config: EstimatorConfig) -> list[Coverage]:
-    """Estimate the pairs of a chunk each by itself, and in sequence with the odometry."""
+@dataclass(frozen=True)
+class Started:
+    """Pairs of a dataset, and how they are started: ALONE or IN_A_ROW."""
+
+    pairs: PairChunk
+    start: str
+
+    @property
+    def name(self) -> str:
+        """Return a name that is the same in every run."""
+        return f'{self.pairs.name}, {self.start}'
+
+    @property
+    def count(self) -> int:
+        """Return the number of pairs."""
+        return self.pairs.count
+
+
+def started_pairs(datasets: Sequence[Dataset]) -> list[Started]:
+    """
+    Return all pairs to estimate, in chunks.
+
+    In a row each sequence is a whole, as it is for the odometry: begun anew in the middle, with a
+    lorry in view that was seen coming, it would know less than the odometry does there.
+    """
+    return [*(Started(chunk, ALONE) for chunk in chunks_of(datasets, _PAIRS_PER_CHUNK)),
+            *(Started(PairChunk(dataset, 0, dataset.pairs), IN_A_ROW) for dataset in datasets)]
+
+
+def cover_chunk(chunk: Started, config: EstimatorConfig) -> list[Coverage]:
+    """Estimate the pairs of a chunk each by itself, or in sequence with the odometry."""
     cv2.setNumThreads(1)
-    return [*_alone(chunk, config), *_in_a_row(chunk, config)]
+    estimate = _alone if chunk.start == ALONE else _in_a_row
+    return list(estimate(chunk.pairs, config))
 
 
 def _alone(chunk: PairChunk, config: EstimatorConfig) -> Iterator[Coverage]:
@@ -144,28 +173,27 @@ def _alone(chunk: PairChunk, config: EstimatorConfig) -> Iterator[Coverage]:
         previous = previous or sequence.frame(frames[pair]).view(estimator)
         current = sequence.frame(frames[pair + 1]).view(estimator)
         pose = estimator.estimate(previous, current)
-        yield from _covered(chunk, ALONE, frames[pair], frames[pair + 1], pose)
+        yield from _covered(chunk.dataset, ALONE, frames[pair], frames[pair + 1], pose)
         previous = current
 
 
 def _in_a_row(chunk: PairChunk, config: EstimatorConfig) -> Iterator[Coverage]:
-    sequence, frames = opened(chunk.dataset), chunk.dataset.frames
+    sequence = opened(chunk.dataset)
     odometry, stamps = VisualOdometry(config), sequence.stamps_ns
-    for number in range(max(chunk.first - _LEAD, 0), chunk.first + chunk.count + 1):
-        current = frames[number]
+    for current in chunk.dataset.frames:
         result = odometry.process(sequence.frame(current))
-        if number > chunk.first and result.relative and result.previous_stamp_ns is not None:
+        if result.relative and result.previous_stamp_ns is not None:
             previous = int(np.searchsorted(stamps, result.previous_stamp_ns))
             pair = result.relative
             if result.stationary:
                 pair = replace(pair, status=result.status, R=np.eye(3), t=np.zeros(3))
-            yield from _covered(chunk, IN_A_ROW, previous, current, pair)
+            yield from _covered(chunk.dataset, IN_A_ROW, previous, current, pair)
 
 
-def _covered(chunk: PairChunk, start: str, previous: int, current: int,
+def _covered(dataset: Dataset, start: str, previous: int, current: int,
              pose: RelativePose) -> Iterator[Coverage]:
     """Yield the record of a pose, if there is ground truth."""
-    poses = opened(chunk.dataset).poses
+    poses = opened(dataset).poses
     assert poses is not None  # datasets without poses are refused at the start
     true_motion = np.linalg.inv(poses[previous]) @ poses[current]
     if not np.isfinite(true_motion).all():
@@ -178,7 +206,7 @@ def _covered(chunk: PairChunk, start: str, previous: int, current: int,
     claims = np.degrees(np.sqrt([np.trace(pose.covariance_5[:3, :3]),
                                  np.trace(pose.covariance_5[3:, 3:])]))
     yield Coverage(
-        _scene(chunk.dataset), chunk.dataset.name, start, previous, current,
+        _scene(dataset), dataset.name, start, previous, current,
         pose.status.value, has_failed(rotation, direction, true_motion), rotation, direction,
         float(claims[0]), float(claims[1]),
         normalised_square(pose, true_motion) if np.isfinite(direction) else float('nan'),

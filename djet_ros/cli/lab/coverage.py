@@ -33,13 +33,13 @@ from djet_ros.lab.coverage import (
     draw_reliability,
     IN_A_ROW,
     LEVELS,
-    PAIRS_PER_CHUNK,
+    started_pairs,
     SURE_DIRECTION,
     SURE_ROTATION,
 )
 from djet_ros.lab.methods import check_names
 from djet_ros.lab.pairs import FAILURE
-from djet_ros.lab.runner import as_completed, chunks_of, local_workers, run as run_chunks
+from djet_ros.lab.runner import as_completed, local_workers, run as run_chunks
 from djet_ros.lab.scenes import render_sequence, SCENES
 from djet_ros.lab.sequences import Dataset
 from djet_ros.lab.store import RecordStore
@@ -100,7 +100,7 @@ def _records(args: argparse.Namespace, datasets: Sequence[Dataset],
     with (RecordStore(args.output, Coverage, settings, ('coverage.json', 'reliability.png'),
                       overwrite=args.overwrite) as store,
           progress_bar('pairs') as progress):
-        return run_chunks(executor, chunks_of(datasets, PAIRS_PER_CHUNK),
+        return run_chunks(executor, started_pairs(datasets),
                           partial(cover_chunk, config=config), store, progress)
 
 
