@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 from djet_ros.core.bodies import (
+    are_of_one_motion,
     continuing_motion,
     fits_followed_body,
     LeftOut,
@@ -19,7 +20,7 @@ from djet_ros.core.geometry import (
     unit,
 )
 from djet_ros.core.jet import jet_problem, JetProblem, Loss
-from djet_ros.core.rivals import pose_distance
+from djet_ros.core.rivals import pose_distance, PreviousMotion
 from djet_ros.core.sketch import refine_all
 from djet_ros.core.surfaces import ReprojectionSurface
 from djet_ros.core.types import Pose, RelativePose, Status
@@ -226,6 +227,34 @@ def test_a_lorry_as_fast_as_the_camera_fits_its_motion() -> None:
     apart, alike = Overtaking(0), Overtaking(0, aside=0.0)
     assert not fits_followed_body(apart.pair(apart.static, apart.of_lorry))
     assert fits_followed_body(alike.pair(alike.static, alike.of_lorry))
+
+
+def turned_by(degrees: float, claim: float) -> RelativePose:
+    """Return a pair that turned to the side, with its standard deviations, both in degrees."""
+    return RelativePose(
+        Status.OK, rotation_exp(np.radians([0, degrees, 0])), AHEAD,
+        own_covariance_5=np.radians(claim)**2 * np.eye(5))
+
+
+def test_all_matches_are_of_one_motion_if_their_pose_covers_that_of_the_followed() -> None:
+    alone, before = turned_by(0.0, 0.4), PreviousMotion(rotation_exp(np.zeros(3)), -AHEAD)
+    assert are_of_one_motion(before, alone, turned_by(0.1, 0.05))
+    # Within what the few that are followed determine, but the claim is smaller.
+    assert not are_of_one_motion(before, alone, turned_by(0.3, 0.05))
+    assert are_of_one_motion(before, alone, turned_by(0.3, 0.1))
+    assert not are_of_one_motion(None, alone, turned_by(0.3, 0.05))
+
+
+def test_of_two_motions_the_one_that_goes_on_decides() -> None:
+    for degrees, all_go_on in ((0.0, False), (0.3, True)):
+        before = PreviousMotion(rotation_exp(np.radians([0, degrees, 0])), AHEAD)
+        # Both cover the other, or neither.
+        for claim in (0.02, 0.3):
+            assert are_of_one_motion(
+                before, turned_by(0.0, claim), turned_by(0.3, claim)) == all_go_on
+    left_open = PreviousMotion(rotation_exp(np.zeros(3)), -AHEAD, undecided=(
+        Pose(rotation_exp(np.radians([0, 0.3, 0])), AHEAD),))
+    assert are_of_one_motion(left_open, turned_by(0.0, 0.02), turned_by(0.3, 0.02))
 
 
 @pytest.mark.slow

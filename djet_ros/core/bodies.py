@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from djet_ros.core.basins import MIN_SCALE
+from djet_ros.core.covariance import is_within, pose_difference
 from djet_ros.core.jet import epipolar_residuals, jet_problem, JetProblem, Loss, robust_scale
 from djet_ros.core.rivals import (
     continues_motion,
@@ -21,6 +22,7 @@ from djet_ros.core.rivals import (
     MIN_BODY_SHARE,
     OUTLIER,
     pose_distance,
+    PreviousMotion,
 )
 from djet_ros.core.sketch import refine_all
 from djet_ros.core.surfaces import ReprojectionSurface
@@ -105,6 +107,27 @@ def fits_followed_body(pair: RelativePose) -> bool:
     """Return whether most of the matches that a pair left out fit its motion."""
     fitting = _errors(pair)[~pair.of_body] < INLIER
     return bool(2 * fitting.sum() > len(fitting))
+
+
+def are_of_one_motion(before: PreviousMotion | None, alone: RelativePose, by_all: RelativePose
+                      ) -> bool:
+    """
+    Return whether the matches that a pair left out are of its motion after all.
+
+    alone: the pair without them; by_all: with them; before: the previous motion. The pair alone
+    has to be within the covariance by all: if nothing else moves, matches are left out where the
+    previous motion was inaccurate. (Few matches determine little, and any pose is within the
+    covariance of those alone.) If just one of the two goes on by the previous motion, that
+    decides; or if it was left open, by another one that all go on by.
+    """
+    one, other = Pose(alone.R, alone.t), Pose(by_all.R, by_all.t)
+    if (before is not None and is_continued(before, alone)
+            and continues_motion(before, one, other)):
+        return False
+    if is_within(by_all.own_covariance_5, pose_difference(one.R, one.t, other)):
+        return True
+    return before is not None and (
+        continues_motion(before, other, one) or before.leaves_open(one, other))
 
 
 class LeftOut:

@@ -10,6 +10,7 @@ from time import perf_counter
 from djet_ros.core.algorithm import evaluate_at, Track
 from djet_ros.core.basins import BASIN_TUNING
 from djet_ros.core.bodies import (
+    are_of_one_motion,
     fits_followed_body,
     is_continued,
     LeftOut,
@@ -17,7 +18,6 @@ from djet_ros.core.bodies import (
 )
 from djet_ros.core.corners import detect_corners, detect_large_corners
 from djet_ros.core.correction import AS_CALIBRATED, Correction
-from djet_ros.core.covariance import is_within, pose_difference
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.features import detect_orb
 from djet_ros.core.fusion import agrees
@@ -29,11 +29,7 @@ from djet_ros.core.memory import keep_freed_memory
 from djet_ros.core.pair import Limits, Observer, Pair
 from djet_ros.core.parallel import run_both
 from djet_ros.core.radial import undistort_image
-from djet_ros.core.rivals import (
-    continues_motion,
-    MIN_BODY_SHARE,
-    PreviousMotion,
-)
+from djet_ros.core.rivals import MIN_BODY_SHARE, PreviousMotion
 from djet_ros.core.starts import (
     external_starts,
     five_point,
@@ -156,11 +152,11 @@ class TwoViewEstimator:
         Estimate the motion of the body that the previous pair followed.
 
         If another body moved there, its matches are left out: by now they may be the majority, or
-        fit a compromise of both motions. But all are used if no other body moves any more, if they
-        go on by the previous motion, or by one that the previous pair left open, or if the others
-        alone fit worse than before and do not go on by it. (A body that hides most of the world
-        leaves few matches, and many of those are false.) If depths tell that what was left out is
-        the static world, the pair is estimated without regard to the one before.
+        fit a compromise of both motions. But all are used if they are of one motion, or if the
+        others alone fit worse than before and do not go on by the previous motion. (A body that
+        hides most of the world leaves few matches, and many of those are false.) If depths tell
+        that what was left out is the static world, the pair is estimated without regard to the one
+        before.
         """
         if prior is None:
             return self.estimate_pair(pair)
@@ -190,12 +186,8 @@ class TwoViewEstimator:
         if sure and not fits_followed_body(alone):
             return alone
         result = self.estimate_pair(pair)
-        if not (reliable or continued) or _is_same(alone, result):
-            return result
-        one, other = _pose(alone), _pose(result)
-        goes_on = before is not None and (
-            continues_motion(before, other, one) or before.leaves_open(one, other))
-        return result if goes_on else alone
+        replaced = not (reliable or continued) or are_of_one_motion(before, alone, result)
+        return result if replaced else alone
 
     def _estimate_alone(self, pair: Pair, followed: NDArray[np.bool_]) -> RelativePose | None:
         """
@@ -372,21 +364,6 @@ def _within_limits(result: RelativePose, limits: Limits) -> bool:
     return (result.status in (Status.OK, Status.NO_PARALLAX)
             and robust_scale(result.residuals[result.of_body]) < limits.max_noise
             and result.inliers[result.of_body].mean() > limits.min_agreeing)
-
-
-def _is_same(one: RelativePose, other: RelativePose) -> bool:
-    """
-    Return whether two estimates are one motion, within the covariance of the first.
-
-    If nothing else moves, matches are left out where the previous motion was inaccurate; they
-    should be in the estimate.
-    """
-    return is_within(one.own_covariance_5,
-                     pose_difference(one.R, one.t, Pose(other.R, other.t)))
-
-
-def _pose(relative: RelativePose) -> Pose:
-    return Pose(relative.R, relative.t)
 
 
 def _previous_motion(prior: RelativePose | None) -> PreviousMotion | None:
