@@ -87,7 +87,7 @@ WITH_LORRIES, LORRIES_PASS_IN = ('moving_object', 'motorway', 'traffic'), 120
 # Frames of a hand-held camera, and how much slower it also moves: as at eighty images a second.
 SLOW_FRAMES, SLOWER = 100, 8
 # Seeds of the drives through crossing traffic.
-CROSSINGS = range(4)
+CROSSINGS = range(8)
 # Second value of estimator.calibration_sigma for real cameras, in pixels: the standard deviation
 # if it is unknown whether pixel centres are at integers or at halves.
 CALIBRATED = '0.25'
@@ -368,9 +368,9 @@ def coverage(place: Path, args: argparse.Namespace) -> dict[str, Any]:
          place / 'rendered')
     rows = covered(place / 'rendered')
     for scene in WITH_LORRIES:
-        djet('lab', 'coverage', '--scenes', scene, '--seeds', '0-4', '--frames', LORRIES_PASS_IN,
+        djet('lab', 'coverage', '--scenes', scene, '--seeds', '0-9', '--frames', LORRIES_PASS_IN,
              '--output', place / scene)
-        rows += covered(place / scene, f'{scene}, {LORRIES_PASS_IN} frames of 5 seeds')
+        rows += covered(place / scene, f'{scene}, {LORRIES_PASS_IN} frames of 10 seeds')
     drives = crossing_drives(place / 'crossing')
     djet('lab', 'coverage', *drives, '--output', place / 'crossed')
     rows += covered(place / 'crossed', f'crossing `traffic`, {len(drives)} drives of '
