@@ -243,6 +243,7 @@ def test_all_matches_are_of_one_motion_if_their_pose_covers_that_of_the_followed
     assert not are_of_one_motion(before, alone, turned_by(0.3, 0.05))
     assert are_of_one_motion(before, alone, turned_by(0.3, 0.1))
     assert not are_of_one_motion(None, alone, turned_by(0.3, 0.05))
+    assert not are_of_one_motion(before, alone, RelativePose(Status.TOO_FEW_MATCHES))
 
 
 def test_of_two_motions_the_one_that_goes_on_decides() -> None:

@@ -124,7 +124,9 @@ def are_of_one_motion(before: PreviousMotion | None, alone: RelativePose, by_all
     if (before is not None and is_continued(before, alone)
             and continues_motion(before, one, other)):
         return False
-    if is_within(by_all.own_covariance_5, pose_difference(one.R, one.t, other)):
+    claimed = by_all.own_covariance_5
+    # Unknown if all together determine no motion.
+    if np.isfinite(claimed).all() and is_within(claimed, pose_difference(one.R, one.t, other)):
         return True
     return before is not None and (
         continues_motion(before, other, one) or before.leaves_open(one, other))
