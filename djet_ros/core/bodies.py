@@ -117,13 +117,11 @@ def are_of_one_motion(before: PreviousMotion | None, alone: RelativePose, by_all
     alone: the pair without them; by_all: with them; before: the previous motion. The pair alone
     has to be within the covariance by all: if nothing else moves, matches are left out where the
     previous motion was inaccurate. (Few matches determine little, and any pose is within the
-    covariance of those alone.) If just one of the two goes on by the previous motion, that
-    decides; or if it was left open, by another one that all go on by.
+    covariance of those alone.) Otherwise they are if only the pose by all goes on by the previous
+    motion, or by one that it left open. That the pose without them goes on does not decide: the
+    previous motion may be the wrong one.
     """
     one, other = Pose(alone.R, alone.t), Pose(by_all.R, by_all.t)
-    if (before is not None and is_continued(before, alone)
-            and continues_motion(before, one, other)):
-        return False
     claimed = by_all.own_covariance_5
     # Unknown if all together determine no motion.
     if np.isfinite(claimed).all() and is_within(claimed, pose_difference(one.R, one.t, other)):
