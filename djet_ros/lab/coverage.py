@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+import sys
 
 import cv2
 from djet_ros.core.covariance import signed_differences
@@ -130,39 +131,34 @@ class CoverageRow:
 
 
 @dataclass(frozen=True)
-class Started:
-    """Pairs of a dataset, and how they are started: ALONE or IN_A_ROW."""
+class StartedChunk(PairChunk):
+    """Pairs of a dataset that are started in the same way: ALONE or IN_A_ROW."""
 
-    pairs: PairChunk
     start: str
 
     @property
     def name(self) -> str:
         """Return a name that is the same in every run."""
-        return f'{self.pairs.name}, {self.start}'
-
-    @property
-    def count(self) -> int:
-        """Return the number of pairs."""
-        return self.pairs.count
+        return f'{super().name}, {self.start}'
 
 
-def started_pairs(datasets: Sequence[Dataset]) -> list[Started]:
+def started_chunks(datasets: Sequence[Dataset]) -> list[StartedChunk]:
     """
     Return all pairs to estimate, in chunks.
 
     In a row each sequence is a whole, as it is for the odometry: begun anew in the middle, with a
     lorry in view that was seen coming, it would know less than the odometry does there.
     """
-    return [*(Started(chunk, ALONE) for chunk in chunks_of(datasets, _PAIRS_PER_CHUNK)),
-            *(Started(PairChunk(dataset, 0, dataset.pairs), IN_A_ROW) for dataset in datasets)]
+    return [StartedChunk(chunk.dataset, chunk.first, chunk.count, start)
+            for start, most in ((ALONE, _PAIRS_PER_CHUNK), (IN_A_ROW, sys.maxsize))
+            for chunk in chunks_of(datasets, most)]
 
 
-def cover_chunk(chunk: Started, config: EstimatorConfig) -> list[Coverage]:
+def cover_chunk(chunk: StartedChunk, config: EstimatorConfig) -> list[Coverage]:
     """Estimate the pairs of a chunk each by itself, or in sequence with the odometry."""
     cv2.setNumThreads(1)
-    estimate = _alone if chunk.start == ALONE else _in_a_row
-    return list(estimate(chunk.pairs, config))
+    return list(_alone(chunk, config) if chunk.start == ALONE
+                else _in_a_row(chunk.dataset, config))
 
 
 def _alone(chunk: PairChunk, config: EstimatorConfig) -> Iterator[Coverage]:
@@ -177,17 +173,17 @@ def _alone(chunk: PairChunk, config: EstimatorConfig) -> Iterator[Coverage]:
         previous = current
 
 
-def _in_a_row(chunk: PairChunk, config: EstimatorConfig) -> Iterator[Coverage]:
-    sequence = opened(chunk.dataset)
+def _in_a_row(dataset: Dataset, config: EstimatorConfig) -> Iterator[Coverage]:
+    sequence = opened(dataset)
     odometry, stamps = VisualOdometry(config), sequence.stamps_ns
-    for current in chunk.dataset.frames:
+    for current in dataset.frames:
         result = odometry.process(sequence.frame(current))
         if result.relative and result.previous_stamp_ns is not None:
             previous = int(np.searchsorted(stamps, result.previous_stamp_ns))
             pair = result.relative
             if result.stationary:
                 pair = replace(pair, status=result.status, R=np.eye(3), t=np.zeros(3))
-            yield from _covered(chunk.dataset, IN_A_ROW, previous, current, pair)
+            yield from _covered(dataset, IN_A_ROW, previous, current, pair)
 
 
 def _covered(dataset: Dataset, start: str, previous: int, current: int,

@@ -33,7 +33,7 @@ from djet_ros.lab.coverage import (
     draw_reliability,
     IN_A_ROW,
     LEVELS,
-    started_pairs,
+    started_chunks,
     SURE_DIRECTION,
     SURE_ROTATION,
 )
@@ -100,7 +100,7 @@ def _records(args: argparse.Namespace, datasets: Sequence[Dataset],
     with (RecordStore(args.output, Coverage, settings, ('coverage.json', 'reliability.png'),
                       overwrite=args.overwrite) as store,
           progress_bar('pairs') as progress):
-        return run_chunks(executor, started_pairs(datasets),
+        return run_chunks(executor, started_chunks(datasets),
                           partial(cover_chunk, config=config), store, progress)
 
 
