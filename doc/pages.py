@@ -500,22 +500,27 @@ def speed(results: Any) -> str:
     part = results['parts'].get('speed')
     if part is None:
         return 'Not measured yet.\n'
-    runs = (part, part['all_cores'])
+    sources = part['sources']
+    first = next(iter(sources.values()))
+    runs = [run for one in sources.values() for run in (one, one['all_cores'])]
     rows = [("time relative to OpenCV's pipeline",
              *(f'{one["pipeline_over_opencv"]:.2f}' for one in runs)),
             ('the same, preset `fast`', *(f'{one["fast_over_opencv"]:.2f}' for one in runs)),
             ('pairs per second', *(f'{one["pairs_per_second"]:.1f}' for one in runs)),
             ('the same, preset `fast`', *(f'{one["fast_pairs_per_second"]:.1f}' for one in runs)),
-            *((f'{stage}, ms', *(f'{one["stages_ms"][stage]:.1f}' for one in runs))
-              for stage in part['stages_ms'])]
+            *((f'{stage}, ms', *(f'{one["stages_ms"].get(stage, 0.0):.1f}' for one in runs))
+              for stage in first['stages_ms'])]
+    columns = [f'{known_as(of)}, {cores}'
+               for of in sources for cores in ('one thread', 'all cores')]
     growth = [(f'{name} {key}', f'{value:.1f}')
               for name, by in (('matches:', 'djet_ms_by_points'), ('window:', 'djet_ms_by_window'))
-              for key, value in part[by].items()]
-    return (paragraph(f'{known_as(part["of"])}, {part["pairs"]} pairs, from file to pose.')
-            + table(('', 'one thread', 'all cores'), rows) + '\n'
+              for key, value in first[by].items()]
+    return (paragraph(f'{first["pairs"]} pairs, from recording to pose. Files are decoded; the '
+                      'bag holds raw images, as a camera driver sends them.')
+            + table(('', *columns), rows) + '\n'
             + paragraph('The D-JET stage (surfaces and optimisation), in ms, by number of matches '
-                        f'and by window side. {kernel(part)}A frame in memory takes '
-                        f'{part["bytes_per_frame"] / 1e6:.1f} MB.')
+                        f'and by window side. {kernel(first)}A frame in memory takes '
+                        f'{first["bytes_per_frame"] / 1e6:.1f} MB.')
             + table(('', 'ms'), growth))
 
 

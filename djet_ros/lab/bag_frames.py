@@ -7,11 +7,9 @@ from pathlib import Path
 import cv2
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.odometry.camera import Camera, is_rectified
-from djet_ros.odometry.images import gray_image
-from djet_ros.odometry.messages import pose_of, stamp_ns
+from djet_ros.lab.corrected_images import corrected_images, CorrectedImage
 from djet_ros.recordings.frame_sequence import FrameSequence, ImageFiles
-from djet_ros.recordings.recording import BagRecording, refuse, up_to_damage, Warn
+from djet_ros.recordings.recording import BagRecording, refuse, Warn
 from djet_ros.replay.ground_truth import GroundTruth
 import numpy as np
 from numpy.typing import NDArray
@@ -49,26 +47,19 @@ def extract(recording: BagRecording, folder: Path, warn: Warn = refuse) -> Path:
     if the bag has no usable frames.
     """
     folder.mkdir(parents=True)
-    camera: Camera | None = None
+    found: CorrectedImage | None = None
     stamps: list[int] = []
     truth = GroundTruth()
-    for topic, _, message in up_to_damage(recording.messages(), warn):
-        if topic == recording.info_topic:
-            camera = camera or Camera.from_info(
-                message, is_rectified('auto', recording.image_topic))
-        elif topic == recording.ground_truth_topic:
-            truth.add(*pose_of(message))
-        elif camera is not None and (not stamps or stamp_ns(message.header) > stamps[-1]):
-            image = camera.corrected(gray_image(message))
-            (folder / f'{len(stamps):06d}.png').write_bytes(_png(image))
-            stamps.append(stamp_ns(message.header))
-    if camera is None or not stamps:
+    for found in corrected_images(recording, warn, truth):
+        (folder / f'{len(stamps):06d}.png').write_bytes(_png(found.gray))
+        stamps.append(found.stamp_ns)
+    if found is None:
         raise DjetError(f'{recording.bag.path} has no image after its first CameraInfo; record '
                         'CameraInfo from the start')
     stamps_ns = np.array(stamps, np.int64)
     poses = truth.at(stamps_ns) if len(truth) else np.empty((0, 4, 4))
-    unseen = camera.unseen(image.shape)
-    np.savez(folder / _INDEX, K=camera.K, stamps_ns=stamps_ns, poses=poses,
+    unseen = found.camera.unseen(found.gray.shape)
+    np.savez(folder / _INDEX, K=found.camera.K, stamps_ns=stamps_ns, poses=poses,
              unseen=np.empty((0, 0), bool) if unseen is None else unseen)
     return folder
 

@@ -7,9 +7,10 @@ alternately and repeatedly in the same process.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any, TypeVar
 
@@ -22,9 +23,8 @@ from djet_ros.core.parallel import start_in_background
 from djet_ros.core.surfaces import DescriptorDistances
 from djet_ros.core.types import Array, RelativePose, View
 from djet_ros.errors import DjetError
-from djet_ros.lab.sequences import readable_frames
-from djet_ros.recordings.frame_sequence import FrameSequence
-from djet_ros.recordings.recording import refuse, Warn
+from djet_ros.lab.corrected_images import corrected_images
+from djet_ros.recordings.recording import open_recording, refuse, Warn
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,29 +46,50 @@ def bench(source: Path, pairs: int,
     """
     Measure the first pairs of a recording with one thread, then with OpenCV's default number.
 
-    Returns the results of the single-threaded run, and those of the other under 'all_cores'.
-    The frames of a bag are extracted first, so that decoding costs the same as for a folder.
-    warn: called with the damage of a bag, which ends there. Raises DjetError if the source is no
+    Returns the results of the single-threaded run, and those of the other under 'all_cores'. Times
+    include reading: files of a folder are decoded; raw images of a bag need no decoding. warn:
+    called with the damage of a bag, which ends there. Raises DjetError if the source is no
     recording of at least two frames.
     """
-    with TemporaryDirectory(prefix='djet-') as workspace:
-        sequence = readable_frames(source, Path(workspace), warn)
-        if len(sequence) < 2:
-            raise DjetError(f'{source} has {len(sequence)} frames; at least 2 are needed')
-        progress('one thread')
-        cv2.setNumThreads(1)
-        figures = measure(sequence, pairs)
-        progress('all cores')
-        cv2.setNumThreads(-1)
-        figures['all_cores'] = measure_pipeline(sequence, pairs)
+    frames = _first_frames(source, pairs + 1, warn)
+    progress('one thread')
+    cv2.setNumThreads(1)
+    figures = measure(frames)
+    progress('all cores')
+    cv2.setNumThreads(-1)
+    figures['all_cores'] = measure_pipeline(frames)
     return figures
 
 
-def measure(sequence: FrameSequence, pairs: int) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Frames:
+    """The first frames of a recording: how many, their camera matrix, and the first two."""
+
+    source: Path
+    count: int
+    K: Array
+    first: tuple[NDArray[np.uint8], NDArray[np.uint8]]
+
+    def images(self) -> Iterator[NDArray[np.uint8]]:
+        """Read the frames anew, and one more if there is one, to be prepared beside the last."""
+        with open_recording(self.source) as recording:
+            for seen in islice(corrected_images(recording), self.count + 1):
+                yield seen.gray
+
+
+def _first_frames(source: Path, most: int, warn: Warn) -> _Frames:
+    with open_recording(source) as recording:
+        seen = list(islice(corrected_images(recording, warn), most))
+    if len(seen) < 2:
+        raise DjetError(f'{source} has {len(seen)} frames; at least 2 are needed')
+    return _Frames(source, len(seen), seen[0].camera.K, (seen[0].gray, seen[1].gray))
+
+
+def measure(frames: _Frames) -> dict[str, Any]:
     """Measure everything: pipeline, D-JET stage by matches and window, descriptors, memory."""
-    figures = measure_pipeline(sequence, pairs)
+    figures = measure_pipeline(frames)
     figures['compiled_loops'] = compiled.library is not None
-    previous, current, x, y = _crowded_pair(sequence)
+    previous, current, x, y = _crowded_pair(frames)
     figures['kernel_speedup_over_cv2'] = kernel_speedup(previous)
     figures['kernel_tests'] = preset('best').binary_tests
     by_points = interleaved_minima({n: _stage(previous, current, x[:n], y[:n])
@@ -78,21 +99,21 @@ def measure(sequence: FrameSequence, pairs: int) -> dict[str, Any]:
     figures['djet_ms_by_window'] = interleaved_minima({
         w: _stage(previous, current, x[:QUOTED_POINTS], y[:QUOTED_POINTS], window=w)
         for w in WINDOWS})
-    figures['bytes_per_frame'] = view_bytes(_estimator().view(sequence.image(0), sequence.K))
+    figures['bytes_per_frame'] = view_bytes(_estimator().view(frames.first[0], frames.K))
     return figures
 
 
-def measure_pipeline(sequence: FrameSequence, pairs: int) -> dict[str, Any]:
-    """Measure times from decoding to pose, of two presets and OpenCV, in turn on each frame."""
-    ours, fast, plain = (_Pipeline(sequence, 'best'), _Pipeline(sequence, 'fast'),
-                         _PlainChain(sequence))
+def measure_pipeline(frames: _Frames) -> dict[str, Any]:
+    """Measure times from reading to pose, of two presets and OpenCV, in turn on each frame."""
+    ours, fast, plain = (_Pipeline(frames, 'best'), _Pipeline(frames, 'fast'),
+                         _PlainChain(frames))
     times: dict[str, list[float]] = {'ours': [], 'fast': [], 'plain': []}
-    for index in range(min(pairs + 1, len(sequence))):
+    for index in range(frames.count):
         # Alternate the order, so that none always finds the file in the cache.
         order = [('ours', ours.take), ('fast', fast.take), ('plain', plain.take)]
         for name, step in order if index % 2 else reversed(order):
             start = perf_counter()
-            step(index)
+            step()
             times[name].append(perf_counter() - start)
     # The first frame has no pair; it warms up the caches.
     ours_s, fast_s, plain_s = (float(np.median(times[name][1:])) for name in times)
@@ -105,33 +126,32 @@ def measure_pipeline(sequence: FrameSequence, pairs: int) -> dict[str, Any]:
 
 
 class _Pipeline:
-    """Our pipeline from file to pose, frame by frame, as in a replay."""
+    """Our pipeline from recording to pose, frame by frame, as in a replay."""
 
-    def __init__(self, sequence: FrameSequence, preset_name: str) -> None:
-        self._sequence = sequence
+    def __init__(self, frames: _Frames, preset_name: str) -> None:
+        self._images, self._K = frames.images(), frames.K
         self._estimator = TwoViewEstimator(preset(preset_name))
         self._view: View | None = None
-        self._ahead: View | None = None
+        self._ahead = self._view_of_next()
         self._prior: RelativePose | None = None
         self._timings: list[dict[str, float]] = []
 
-    def take(self, index: int) -> None:
-        """Estimate the pair that ends with a frame, preparing the next frame in parallel."""
+    def take(self) -> None:
+        """Estimate the pair that ends with the next frame, preparing another in parallel."""
         start = perf_counter()
-        view = self._ahead or self._view_of(index)
-        last = len(self._sequence) - 1
-        following = start_in_background(lambda: self._view_of(min(index + 1, last)))
-        if self._view is not None:
+        view, following = self._ahead, start_in_background(self._view_of_next)
+        if self._view is not None and view is not None:
             self._prior = self._estimator.estimate(self._view, view, self._prior)
         self._view, self._ahead = view, following()
         if self._prior is not None:
             timings = self._prior.timings
             # Work done in parallel to the pair does not count: stages add up to the total.
             rest = perf_counter() - start - sum(timings.values())
-            self._timings.append({'decode + features': rest, **timings})
+            self._timings.append({'reading + features': rest, **timings})
 
-    def _view_of(self, index: int) -> View:
-        return self._estimator.view(self._sequence.image(index), self._sequence.K)
+    def _view_of_next(self) -> View | None:
+        image = next(self._images, None)
+        return None if image is None else self._estimator.view(image, self._K)
 
     def stages_ms(self) -> dict[str, float]:
         """Return mean times over all pairs, 0 for pairs without a stage, so that they add up."""
@@ -143,21 +163,21 @@ class _Pipeline:
 class _PlainChain:
     """OpenCV's usual chain: ORB, brute-force cross-check, 5-point RANSAC, recoverPose."""
 
-    def __init__(self, sequence: FrameSequence) -> None:
-        self._sequence = sequence
+    def __init__(self, frames: _Frames) -> None:
+        self._images, self._K = frames.images(), frames.K
         self._orb = cv2.ORB.create(preset('best').max_features)
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
         self._last: tuple[Any, Any] | None = None
 
-    def take(self, index: int) -> None:
-        K = self._sequence.K
-        keypoints, descriptors = self._orb.detectAndCompute(self._sequence.image(index), None)
+    def take(self) -> None:
+        keypoints, descriptors = self._orb.detectAndCompute(next(self._images), None)
         if self._last is not None:
             matches = self._matcher.match(self._last[1], descriptors)
             x = np.array([self._last[0][m.queryIdx].pt for m in matches])
             y = np.array([keypoints[m.trainIdx].pt for m in matches])
-            E, mask = cv2.findEssentialMat(x, y, K, method=cv2.RANSAC, prob=0.999, threshold=1.0)
-            cv2.recoverPose(E[:3], x, y, K, mask=mask)
+            E, mask = cv2.findEssentialMat(x, y, self._K, method=cv2.RANSAC, prob=0.999,
+                                           threshold=1.0)
+            cv2.recoverPose(E[:3], x, y, self._K, mask=mask)
         self._last = keypoints, descriptors
 
 
@@ -205,11 +225,11 @@ def _estimator(**changes: Any) -> TwoViewEstimator:
     return TwoViewEstimator(preset('best', **changes))
 
 
-def _crowded_pair(sequence: FrameSequence) -> tuple[View, View, Array, Array]:
+def _crowded_pair(frames: _Frames) -> tuple[View, View, Array, Array]:
     """Return views and many matches of the first two frames, in random order for subsetting."""
     # ORB: our corners keep a minimum distance, which limits their number.
     crowd = _estimator(detector='orb', max_features=4 * max(POINTS), fast_threshold=5)
-    previous, current = (crowd.view(sequence.image(i), sequence.K) for i in (0, 1))
+    previous, current = (crowd.view(image, frames.K) for image in frames.first)
     x, y = crowd.match(previous, current)
     order = np.random.default_rng(0).permutation(len(x))
     return previous, current, x[order], y[order]
