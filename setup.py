@@ -34,8 +34,9 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
         (f'share/{package_name}', ['package.xml']),
-        (f'share/{package_name}/config', glob('config/*')),
-        (f'share/{package_name}/launch', glob('launch/*')),
+        # Files, but not __pycache__, which a launch file leaves when it is run from here.
+        (f'share/{package_name}/config', glob('config/*.*')),
+        (f'share/{package_name}/launch', glob('launch/*.*')),
     ],
     # Inner loops, optional: without a C compiler those in NumPy run, and a frame takes 1.5 times
     # as long. -fno-wrapv: no index overflows, and Python's own -fwrapv prevents optimisations.

@@ -19,7 +19,7 @@ from djet_ros.errors import DjetError
 from djet_ros.odometry.messages import pose_of
 from djet_ros.recordings.bag_writers import ResultBag, STORAGES, write_kitti_bag
 from djet_ros.recordings.bags import Bag
-from djet_ros.recordings.decoding import decoder, jazzy, MAKE, message_type, MOST_ELEMENTS
+from djet_ros.recordings.decoding import decoder, jazzy, MAKE, message_type, MOST_OBJECTS
 from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.recording import BagRecording
 from djet_ros.recordings.storages import open_storage
@@ -826,6 +826,9 @@ def test_a_path_that_is_no_bag_is_refused(tmp_path):
     ("UPDATE topics SET type = 'a/msg/B'; DROP TABLE message_definitions",
      "type 'a/msg/B' can't be used: ValueError it is not in"),
     ("UPDATE messages SET timestamp = 'now' WHERE id = 7", "holds the stamp 'now'"),
+    ('UPDATE messages SET timestamp = -1 WHERE id = 7', 'at a time that ROS has no stamp for'),
+    (f'UPDATE messages SET timestamp = {2**31 * SECOND} WHERE id = 7',
+     'at a time that ROS has no stamp for'),
     ("UPDATE messages SET data = 'text' WHERE id = 7", "with the data 'text'"),
     ("UPDATE messages SET data = x'00' WHERE id = 7", 'at 4000000000 ns: it is no sensor_msgs'),
     ("UPDATE messages SET data = x'28b52ffd00' WHERE id = 7", 'a zstd message is'),
@@ -864,6 +867,60 @@ def test_wrong_metadata_is_refused(tmp_path, metadata, problem):
     (path / 'metadata.yaml').write_text(
         f'rosbag2_bagfile_information: {{relative_file_paths: {metadata}}}')
     assert problem in source_error(path)
+
+
+@pytest.mark.parametrize(('table', 'columns'), [
+    ('messages', 'id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, '
+                 'data BLOB GENERATED ALWAYS AS (zeroblob(100000000))'),
+    ('topics', 'id INTEGER PRIMARY KEY, type TEXT, serialization_format TEXT, '
+               'name TEXT GENERATED ALWAYS AS (hex(zeroblob(60000000)))'),
+    ('message_definitions', 'topic_type TEXT, encoding TEXT, encoded_message_definition TEXT '
+                            f"DEFAULT '{'x' * 100}'")])
+def test_a_database_with_values_that_are_not_in_the_file_is_refused(
+        whole, tmp_path, table, columns):
+    """Of a few kB, with 30 rows, they would be gigabytes."""
+    path = shutil.copy(whole['db3'], tmp_path / 'small.db3')
+    with sqlite3.connect(path) as database:
+        database.executescript(f'DROP TABLE {table}; CREATE TABLE {table} ({columns})')
+    delivered, problem = read_until_broken(path)
+    assert delivered == []
+    assert problem is not None
+    assert f"its table '{table}' is not one of rosbag2's" in problem
+
+
+def test_a_virtual_table_is_no_table_of_a_bag(whole, tmp_path):
+    path = shutil.copy(whole['db3'], tmp_path / 'virtual.db3')
+    with sqlite3.connect(path) as database:
+        database.executescript('DROP TABLE messages; CREATE VIRTUAL TABLE messages USING '
+                               'fts5(topic_id, timestamp, data)')
+    assert "its table 'messages' is not one of rosbag2's" in str(read_until_broken(path)[1])
+
+
+def test_messages_without_an_index_are_sorted_without_their_data(tmp_path):
+    """All that SQLite sorts goes into a temporary file, which would be as large as the bag."""
+    stamps = [3, 1, 2]
+    path = record(tmp_path / 'bag', [('/image', image(stamp), stamp) for stamp in stamps],
+                  'sqlite3') / 'bag.db3'
+    with sqlite3.connect(path) as database:
+        database.execute('DROP INDEX timestamp_idx')
+    statements = []
+    connect = sqlite3.connect
+
+    def traced(*arguments, **options):
+        database = connect(*arguments, **options)
+        database.set_trace_callback(statements.append)
+        return database
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sqlite3, 'connect', traced)
+        delivered, problem = read_until_broken(path)
+    assert problem is None
+    assert [message.stamp_ns for message in delivered] == sorted(stamps)
+    with connect(path) as database:
+        plans = {statement: database.execute(f'EXPLAIN QUERY PLAN {statement}').fetchall()
+                 for statement in statements if 'FROM messages' in statement}
+    assert not [statement for statement, plan in plans.items()
+                if 'data' in statement and 'TEMP B-TREE' in str(plan)]
 
 
 def chunk_bomb(data, declared):
@@ -991,11 +1048,29 @@ def test_elements_that_take_no_bytes_are_refused():
 
 
 @pytest.mark.parametrize(('encoding', 'element', 'size'), [
-    ('ros1', 'uint8 x', MOST_ELEMENTS + 1), ('cdr', 'uint8 x', MOST_ELEMENTS + 1),
-    ('ros1', 'string x', 4 * MOST_ELEMENTS + 1), ('ros1', 'float64[3] x', 25 * MOST_ELEMENTS)])
+    # Each element becomes two objects: itself, and the field.
+    ('ros1', 'uint8 x', MOST_OBJECTS // 2 + 1), ('cdr', 'uint8 x', MOST_OBJECTS // 2 + 1),
+    ('ros1', 'string x', 2 * MOST_OBJECTS + 1), ('ros1', 'float64[3] x', 12 * MOST_OBJECTS + 1)])
 def test_messages_that_may_unfold_to_more_than_memory_holds_are_refused(encoding, element, size):
     with pytest.raises(BrokenFile, match='could exceed the memory when deserialised'):
         outer(2**20, element, size, encoding)
+
+
+def test_transforms_that_unfold_to_many_times_their_bytes_are_refused():
+    """Of 1.7 million transforms in 129 MB, few enough bytes, the objects would take gigabytes."""
+    noetic = get_typestore(Stores.ROS1_NOETIC)
+    one, _ = noetic.generate_msgdef('geometry_msgs/msg/TransformStamped')
+    definition = (f'geometry_msgs/TransformStamped[] transforms\n{"=" * 80}\n'
+                  f'MSG: geometry_msgs/TransformStamped\n{one}')
+    read = decoder(Connection(0, '/tf', 'tf2_msgs/msg/TFMessage', 'ros1', definition, 1))
+    of_one = 76
+    for count, refused in ((1_700_000, True), (100_000, False)):
+        data = memoryview(struct.pack('<I', count) + bytes(of_one * count))
+        if refused:
+            with pytest.raises(BrokenFile, match='could exceed the memory when deserialised'):
+                read(data)
+        else:
+            assert len(read(data).transforms) == count
 
 
 def test_sequences_of_messages_are_read():

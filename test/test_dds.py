@@ -445,6 +445,16 @@ def test_graph_can_be_joined_again_after_leaving():
         assert second is not first
 
 
+def test_a_topic_is_seen_among_more_than_a_thousand_others():
+    from djet_ros.dds.graph import Graph
+    elsewhere = {**ENVIRONMENT, 'ROS_DOMAIN_ID': '230'}
+    with Graph(elsewhere) as graph:
+        writers = [graph.advertise(f'/topic_{number}', 'std_msgs/msg/String')
+                   for number in range(1100)]
+        writers.append(graph.advertise('/camera/camera_info', 'sensor_msgs/msg/CameraInfo'))
+        assert graph.published('sensor_msgs/msg/CameraInfo') == ['/camera/camera_info']
+
+
 # Without a graph
 
 def test_names_are_resolved_and_remapped_as_in_ros():

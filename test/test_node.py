@@ -817,3 +817,19 @@ def test_signal_during_a_stream_ends_the_node_within_a_second(
         RELATIVE, f'{NODE}/relative_pose_cov')}) == 1
     assert not [line for line in one.log.splitlines()
                 if not line.startswith(('[INFO]', '[WARN]'))]
+
+
+def test_a_publisher_has_no_listeners_once_its_node_is_destroyed(tmp_path):
+    """An image may take longer than the node waits for it at its end."""
+    script = ('import rclpy\n'
+              'from djet_ros.ros.middleware import RosPublisher\n'
+              'from std_msgs.msg import String\n'
+              'rclpy.init()\n'
+              'node = rclpy.create_node("ends")\n'
+              'publisher = RosPublisher(node.create_publisher(String, "topic", 1))\n'
+              'assert publisher.listeners == 0\n'
+              'node.destroy_node()\n'
+              'print(publisher.listeners)\n')
+    run = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True,
+                         cwd=tmp_path, timeout=60)
+    assert (run.stdout, run.returncode) == ('0\n', 0), run.stderr

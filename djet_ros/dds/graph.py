@@ -38,6 +38,9 @@ _MAX_BLOCKING = duration(milliseconds=20)
 # Samples in a keep-all history, at either end, before the publisher blocks.
 _KEEP_ALL_SAMPLES = 32
 
+# Endpoints of a graph that are seen: a ROS node has about ten, and some per topic.
+_MOST_ENDPOINTS = 1 << 16
+
 _GONE = (DDSException.DDS_RETCODE_BAD_PARAMETER, DDSException.DDS_RETCODE_ALREADY_DELETED)
 
 _ANY = ViewState.Any | InstanceState.Any | SampleState.NotRead
@@ -290,7 +293,7 @@ class Graph:
 
 
 def _alive(reader: BuiltinDataReader) -> list[Any]:
-    return [one for one in reader.read(1000)
+    return [one for one in reader.read(_MOST_ENDPOINTS)
             if one.sample_info.instance_state == InstanceState.Alive]
 
 

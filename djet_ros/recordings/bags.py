@@ -17,6 +17,9 @@ from djet_ros.recordings.decoding import Decoder, decoder
 from djet_ros.recordings.storages import BrokenFile, Connection, open_storage, Storage
 from djet_ros.recordings.storages.compression import decompress_file, ZSTD_MAGIC
 
+# Stamps of ROS have seconds of 32 bits, since 1970.
+_STAMPS_END = 2**31 * 10**9
+
 STORAGE_NAMES = re.compile(r'.*\.(mcap|db3)(\.zstd)?')
 
 
@@ -122,6 +125,8 @@ def _decoded(storage: Storage, chosen: dict[int, Connection]) -> Iterator[BagMes
     for number, stamp, data in storage.messages(chosen):
         topic = chosen[number].topic
         try:
+            if not 0 <= stamp < _STAMPS_END:
+                raise BrokenFile('it was recorded at a time that ROS has no stamp for')
             if number not in decoders:
                 decoders[number] = decoder(chosen[number])
             message = decoders[number](data)

@@ -29,9 +29,9 @@ Decoder: TypeAlias = Callable[[memoryview], Any]
 LONGEST_DEFINITION = 32 << 10
 MOST_FIXED_ELEMENTS = 256
 
-# Limit of the elements of sequences of messages or strings: each becomes an object of a hundred
-# bytes or more in memory, from as little as one byte, or none, of the message.
-MOST_ELEMENTS = 1 << 22
+# Limit of the objects in sequences of messages or strings: each takes a hundred bytes or more in
+# memory, from as little as one byte, or none, of the message.
+MOST_OBJECTS = 1 << 22
 
 # Minimum serialised size of basic types in bytes; all others have 1.
 BYTES = {'int16': 2, 'uint16': 2, 'int32': 4, 'uint32': 4, 'float32': 4, 'string': 4, 'int64': 8,
@@ -68,12 +68,13 @@ def decoder(connection: Connection) -> Decoder:
         if connection.msgtype not in store.types:
             raise ValueError('it is not in ROS 2 Jazzy, and the bag holds no definition of it')
         store.get_msgdef(connection.msgtype)
-        largest = _largest_message(store, connection.msgtype)
+        converted = store is not jazzy() and connection.msgtype in jazzy().types
+        largest = _largest_message(store, connection.msgtype, copies=2 if converted else 1)
     except Exception as error:
         raise BrokenFile(f"its type '{connection.msgtype[:80]}' can't be used: "
                          f'{type(error).__name__} {one_line(error)[:120]}') from error
     convert: Callable[[Any], Any] = _identity
-    if store is not jazzy() and connection.msgtype in jazzy().types:
+    if converted:
         convert = _converter(store, connection.msgtype)
     return partial(_decode, connection, store, convert, largest)
 
@@ -112,16 +113,17 @@ def _store(connection: Connection) -> Typestore:
     return store
 
 
-def _largest_message(store: Typestore, msgtype: str) -> int:
-    """Return the bytes beyond which a message could have more than MOST_ELEMENTS elements."""
-    least = min(_elements(store, (Nodetype.NAME, msgtype)), default=LARGEST_PIECE)
-    if least == 0:
+def _largest_message(store: Typestore, msgtype: str, copies: int) -> int:
+    """Return the bytes beyond which a message could become more than MOST_OBJECTS objects."""
+    elements = list(_elements(store, (Nodetype.NAME, msgtype)))
+    if any(size == 0 for size, _ in elements):
         raise ValueError('it has sequences of elements that take no bytes')
-    return min(least * MOST_ELEMENTS, LARGEST_PIECE)
+    return min([LARGEST_PIECE, *(
+        size * MOST_OBJECTS // (copies * objects) for size, objects in elements)])
 
 
-def _elements(store: Typestore, kind: Any) -> Iterator[int]:
-    """Yield the minimum element sizes of all sequences of messages or strings in a field type."""
+def _elements(store: Typestore, kind: Any) -> Iterator[tuple[int, int]]:
+    """Yield, of all sequences of messages or strings, the least bytes and objects per element."""
     node, detail = kind
     if node == Nodetype.NAME:
         for _, inner in store.fielddefs[detail][1]:
@@ -129,8 +131,18 @@ def _elements(store: Typestore, kind: Any) -> Iterator[int]:
     elif node != Nodetype.BASE:
         inner = detail[0]
         if node == Nodetype.SEQUENCE and (inner[0] != Nodetype.BASE or inner[1][0] == 'string'):
-            yield _least_bytes(store, inner)
+            yield _least_bytes(store, inner), _objects(store, inner)
         yield from _elements(store, inner)
+
+
+def _objects(store: Typestore, kind: Any) -> int:
+    """Return how many objects a field becomes; elements of sequences are counted by themselves."""
+    node, detail = kind
+    if node == Nodetype.NAME:
+        return 1 + sum(_objects(store, inner) for _, inner in store.fielddefs[detail][1])
+    if node == Nodetype.ARRAY and (detail[0][0] != Nodetype.BASE or detail[0][1][0] == 'string'):
+        return 1 + int(detail[1]) * _objects(store, detail[0])
+    return 1
 
 
 def _least_bytes(store: Typestore, kind: Any) -> int:

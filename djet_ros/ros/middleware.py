@@ -17,6 +17,7 @@ from djet_ros.odometry.messages import pose_of
 from djet_ros.ros.command_line import topic_remappings
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.exceptions import InvalidHandle
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher as RclpyPublisher
@@ -63,8 +64,11 @@ class RosPublisher:
 
     @property
     def listeners(self) -> int:
-        """Return the number of subscriptions."""
-        return int(self._publisher.get_subscription_count())
+        """Return the number of subscriptions; 0 once the node is destroyed."""
+        try:
+            return int(self._publisher.get_subscription_count())
+        except InvalidHandle:
+            return 0
 
 
 class _WhenReady(MutuallyExclusiveCallbackGroup):  # type: ignore[misc]

@@ -14,6 +14,10 @@ from djet_ros.recordings.storages.base import BrokenFile, Connection, LARGEST_PI
 
 MAGIC = b'SQLite format 3\x00'
 
+_TABLES = ('messages', 'topics', 'message_definitions')
+
+_MESSAGE = 'SELECT topic_id, timestamp, data FROM messages WHERE rowid = ?'
+
 Message: TypeAlias = tuple[int, int, memoryview]
 
 
@@ -30,24 +34,23 @@ class SqliteFile:
                 raise BrokenFile(str(error)) from error
 
     def _read_topics(self, database: sqlite3.Connection) -> list[Connection]:
-        tables = {name for name, in database.execute(
-            "SELECT name FROM sqlite_master WHERE type = 'table'")}
+        tables = _tables(database)
         if missing := {'topics', 'messages'} - tables:
             raise BrokenFile(f"it has no table '{min(missing)}': it was cut short, or not written "
                              'by rosbag2')
         # Message definitions are stored since ROS 2 Iron.
-        definitions = dict(database.execute(
+        definitions = dict(_bounded(database.execute(
             'SELECT topic_type, encoded_message_definition FROM message_definitions '
-            "WHERE encoding = 'ros2msg'")) if 'message_definitions' in tables else {}
+            "WHERE encoding = 'ros2msg'"))) if 'message_definitions' in tables else {}
         counts = _count(database)
-        rows = database.execute('SELECT id, name, type, serialization_format FROM topics '
-                                'ORDER BY id').fetchall()
+        rows = list(_bounded(database.execute(
+            'SELECT id, name, type, serialization_format FROM topics')))
         for row in rows:
             if not isinstance(row[0], int) or not all(isinstance(word, str) for word in row[1:]):
                 raise BrokenFile(f"its table 'topics' holds the row {row!r:.80}")
         return [Connection(number, topic, ros2_name(msgtype), encoding,
                            str(definitions.get(msgtype, '')), counts.get(number, 0))
-                for number, topic, msgtype, encoding in rows]
+                for number, topic, msgtype, encoding in sorted(rows)]
 
     def messages(self, wanted: Collection[int]) -> Iterator[Message]:
         """
@@ -59,20 +62,49 @@ class SqliteFile:
         return _but_last_before_break(messages) if _ends_within_page(self.path) else messages
 
     def _in_order(self, wanted: Collection[int]) -> Iterator[Message]:
-        query = ('SELECT topic_id, timestamp, data FROM messages '
+        # Only what is sorted is held, in memory or a temporary file: without an index, all of it.
+        query = ('SELECT rowid FROM messages '
                  f'WHERE topic_id IN ({", ".join("?" * len(wanted))}) ORDER BY ')
         delivered = False
         with closing(_connect(self.path)) as database:
             # If the index by stamps is damaged but the messages are not: in recorded order.
-            for order in ('timestamp, id', 'id'):
+            for order in ('timestamp, rowid', 'rowid'):
                 try:
                     for row in database.execute(query + order, tuple(wanted)):
-                        yield _checked(row)
+                        yield from map(_checked, database.execute(_MESSAGE, row))
                         delivered = True
                     return
                 except sqlite3.Error as error:
-                    if delivered or order == 'id':
+                    if delivered or order == 'rowid':
                         raise BrokenFile(f'{error}; everything before that was read') from error
+
+
+def _tables(database: sqlite3.Connection) -> set[str]:
+    """
+    Return the names of the tables of rosbag2's in a database.
+
+    Raises BrokenFile if one has values that are not in the file but made up when they are read,
+    without a limit: those of a virtual table, of a generated column, or a long default.
+    """
+    roots = dict(database.execute("SELECT name, rootpage FROM sqlite_master WHERE type = 'table' "
+                                  f"AND name IN ({', '.join('?' * len(_TABLES))})", _TABLES))
+    for name, root in roots.items():
+        invented = database.execute('SELECT count(*) FROM pragma_table_xinfo(?) '
+                                    'WHERE hidden OR length(dflt_value) > 99', (name,)).fetchone()
+        if not root or invented != (0,):
+            raise BrokenFile(f"its table '{name}' is not one of rosbag2's: it has values that are "
+                             'not in the file')
+    return set(roots)
+
+
+def _bounded(rows: Iterator[tuple[Any, ...]]) -> Iterator[tuple[Any, ...]]:
+    """Yield rows; raise BrokenFile if they exceed the limit of anything read at once."""
+    size = 0
+    for row in rows:
+        size += sum(len(value) if isinstance(value, (str, bytes)) else 8 for value in row)
+        if size > LARGEST_PIECE:
+            raise BrokenFile(f'its topics and definitions exceed {LARGEST_PIECE} bytes')
+        yield row
 
 
 def _ends_within_page(path: Path) -> bool:
@@ -104,7 +136,8 @@ def _checked(row: tuple[Any, Any, Any]) -> Message:
 def _count(database: sqlite3.Connection) -> dict[int, int]:
     """Return messages per topic id; 1 each in a damaged file, which can't be counted."""
     try:
-        return dict(database.execute('SELECT topic_id, count(*) FROM messages GROUP BY topic_id'))
+        return dict(_bounded(database.execute(
+            'SELECT topic_id, count(*) FROM messages GROUP BY topic_id')))
     except sqlite3.DatabaseError:
         return dict.fromkeys((number for number, in database.execute('SELECT id FROM topics')), 1)
 
