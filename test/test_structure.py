@@ -423,7 +423,7 @@ def test_the_window_keeps_few_views(cards):
     drive.go([pose(x=0.16, z=0.12, yaw=0.004)] * 14)
     window = drive.odometry._scale._window
     assert len(window._views) <= 7
-    assert len(window._landmarks) < 2000
+    assert len(window._joint.landmarks) < 2000
     assert window.landmarks().shape[1] == 3
     assert (window.landmarks()[:, 2] > 0).mean() > 0.9
 
@@ -536,11 +536,11 @@ def test_the_measurement_of_a_landmark_does_not_depend_on_its_prediction(cards):
     drive = Drive(cards)
     drive.go([pose(x=0.16, z=0.03)] * 4)
     window = drive.odometry._scale._window
-    found = window._landmarks
+    found = window._joint.landmarks
     before, seen = found.minima[:, -1].copy(), found.observed[:, -1].copy()
-    focal, R = window._K[0, 0], window._poses.R.copy()
+    focal, R = window._joint.K[0, 0], window._joint.poses.R.copy()
     for pixels in (-1.0, -0.5, 0.5, 1.0):
-        window._poses.R[-1] = rotation_exp(np.array([0.0, pixels / focal, 0.0])) @ R[-1]
+        window._joint.poses.R[-1] = rotation_exp(np.array([0.0, pixels / focal, 0.0])) @ R[-1]
         found.observed[:, -1] = False
         window._observe_landmarks()
         both = seen & found.observed[:, -1]
@@ -561,7 +561,7 @@ def test_landmarks_are_not_chosen_by_the_errors_of_their_own_depths(cards):
     window._append(views[1], wrong, 1.0)
     window._create_landmarks(wrong, 1.0)
     at = {tuple(x): factor for x, factor in zip(pair.x, factors)}
-    chosen = np.log([at[tuple(x)] for x in window._landmarks.anchor_pixels])
+    chosen = np.log([at[tuple(x)] for x in window._joint.landmarks.anchor_pixels])
     assert len(chosen) == 40
     assert abs(chosen.mean() - np.log(factors[pair.inliers]).mean()) < 3 * 0.5 / np.sqrt(40)
 

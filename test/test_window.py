@@ -6,7 +6,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
-from djet_ros.core.bundle import points_in_frame, projected
+from djet_ros.core.bundle import projected
 from djet_ros.core.correction import AS_CALIBRATED, Correction
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import (
@@ -117,12 +117,12 @@ class NumbersWindow(Window):
         self._which.update(zip(map(tuple, pair.x.tolist()), which.tolist()))
         self._frame += 1
         self.pairs.append(pair.R)
-        self.added = self.add(blank(self._K), pair, self._unit)
+        self.added = self.add(blank(self._joint.K), pair, self._unit)
         return self.added.length
 
     def correct(self) -> float:
         """Continue with images of the camera as it is expected to be."""
-        before, street = self._landmarks.anchor_pixels, self._street
+        before, street = self._joint.landmarks.anchor_pixels, self._street
         shown = self.calibration.deviation.camera_matrix(K), self.calibration.deviation.k1
         ratio = self.correct_images(blank(shown[0]))
         moved = undistort(shown[0], distort(street.shown[0], before, street.shown[1]), shown[1])
@@ -135,22 +135,28 @@ class NumbersWindow(Window):
         return view
 
     def _observe_landmarks(self) -> None:
-        found, newest = self._landmarks, len(self._views) - 1
+        found, newest = self._joint.landmarks, len(self._views) - 1
         places, seen = self._street.seen(self._frame)
         mine = np.array([self._which[tuple(point)] for point in found.anchor_pixels.tolist()], int)
-        pixels = projected(self._K, points_in_frame(self._K, self._poses, found, newest))
+        pixels = self._joint.pixels_in(newest, found)
         wanted = seen[mine] & inside(pixels)
         wanted &= found.observed[:, -3:-1].any(1) | (found.anchors == newest - 1)
         found.minima[wanted, -1], found.observed[wanted, -1] = places[mine[wanted]], True
         found.roots[wanted, -1] = np.eye(2)
 
-    def _refine(self) -> Numbers:
-        before = int(self._landmarks.observed[:, -1].sum())
-        H = super()._refine()
-        self.scales.append(self._scale)
-        self.taken += before
-        self.thrown += before - int(self._landmarks.observed[:, -1].sum())
-        return H
+    def start(self, *arguments: Any, **options: Any) -> None:
+        super().start(*arguments, **options)
+        refine = self._joint.refine
+
+        def counted() -> Numbers:
+            before = int(self._joint.landmarks.observed[:, -1].sum())
+            H = refine()
+            self.scales.append(self._joint.scale)
+            self.taken += before
+            self.thrown += before - int(self._joint.landmarks.observed[:, -1].sum())
+            return H
+
+        self._joint.refine = counted  # type: ignore[method-assign]
 
 
 def inside(places: Numbers) -> NDArray[np.bool_]:
@@ -246,7 +252,7 @@ def test_an_uncertain_step_is_searched_where_landmarks_are_and_expected_by_the_g
     searched = list[float]()
 
     def observe_none() -> None:
-        searched.append(float(np.linalg.norm(window._poses.relative_motions[1][-1, -2])))
+        searched.append(float(np.linalg.norm(window._joint.poses.relative_motions[1][-1, -2])))
 
     def count_found(view: Any, relative: RelativePose, length: float) -> int:
         assert length == guess or 1 < length < guess
@@ -328,8 +334,8 @@ def test_a_correction_far_beyond_first_order_leaves_lengths_positive() -> None:
         window = NumbersWindow(Street(0, 80, 0.1, curve=0.02))
         for _ in range(70):
             window.go()
-        window._adapt_to(np.array([k1, 0, 0, 0]))
-        assert 0.3 < window._newest_length < 2
+        window._joint.adapt_to(np.array([k1, 0, 0, 0]))
+        assert 0.3 < window._joint.newest_length < 2
 
 
 @pytest.mark.slow
