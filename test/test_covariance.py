@@ -69,10 +69,15 @@ def test_a_calibration_error_moves_a_pose_as_its_covariance_predicts(camera, t):
         wrong = minimise(problem(calibrated(camera, **{name: off})), views.R, views.t, loss)
         moves.append(np.append(rotation_log(wrong.R @ there.R.T), wrong.t - there.t))
     moves = np.transpose(moves)
-    estimated = calibration_covariance(right, camera, there.pose, there.residuals, loss, off)
     size = np.sqrt(np.diag(moves @ moves.T))
     assert size[:3].max() > 1e-5 and size[3:].max() > 1e-4
-    np.testing.assert_array_less(np.abs(estimated - moves @ moves.T), 0.05 * np.outer(size, size))
+    for flipped in (False, True):
+        estimated = calibration_covariance(right, camera, there.pose, there.residuals, loss, off,
+                                           flipped)
+        # The opposite direction moves oppositely.
+        expected = np.diag([1] * 3 + [-1 if flipped else 1] * 3) @ moves
+        np.testing.assert_array_less(np.abs(estimated - expected @ expected.T),
+                                     0.05 * np.outer(size, size))
 
 
 @pytest.mark.slow

@@ -827,3 +827,18 @@ def test_skew_does_not_affect_the_start(robust, t):
         assert inliers.all()
         assert np.degrees(rotation_angle(start.R, seen.R)) < 0.01
         assert np.degrees(direction_angle(start.t, seen.t)) < 0.1
+
+
+def test_estimating_near_a_motion_leaves_out_what_the_pair_did():
+    """Otherwise another body, whose memory the result is, would vote again."""
+    rng = np.random.default_rng(0)
+    seen = two_views(rng)
+    views = [uniform_view(), uniform_view()]
+    estimator = TwoViewEstimator(EstimatorConfig(method='rpe'))
+    pair = estimator.estimate_matched(*views, seen.x, seen.y)
+    left_out = rng.random(len(seen.x)) < 0.2
+    moved = seen.y + 20.0 * left_out[:, None]
+    near = estimator.estimate_near(*views, replace(pair, y=moved, left_out=left_out),
+                                   Pose(pair.R, pair.t))
+    np.testing.assert_array_equal(near.of_body, ~left_out)
+    assert not (near.inliers | near.voting)[left_out].any() and near.voting.sum() > 50

@@ -97,6 +97,18 @@ def test_a_squared_residual_is_what_the_line_costs_above_the_surfaces_own_minimu
     assert (residuals.sign < 0).any() == (kind == 'indefinite')
 
 
+@pytest.mark.parametrize('camera', [K, SKEWED])
+def test_another_camera_matrix_is_as_if_the_problem_had_been_made_with_it(camera):
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, 1000, (2, 30, 2))
+    surfaces, other = random_surfaces(rng, y, 'bowls'), camera * [[1.1], [1.1], [1]] + [
+        [0, 0, 3], [0, 0, -2], [0, 0, 0]]
+    made, before = (jet_problem(matrix, x, surfaces, epipole_blur=20.0)
+                    for matrix in (other, camera))
+    for one, another in zip(made.matches, before.with_camera(camera, other).matches):
+        np.testing.assert_allclose(another, one, rtol=1e-9)
+
+
 def test_residuals_of_circles_are_the_distances_to_the_epipolar_lines_in_pixels():
     rng = np.random.default_rng(4)
     x, y = rng.uniform(0, 1000, (2, 40, 2))

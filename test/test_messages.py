@@ -178,6 +178,34 @@ def test_odometry_has_the_pose_in_the_odom_frame_and_the_twist_in_the_camera(fam
     assert np.allclose(rotation_exp(np.array([angular.x, angular.y, angular.z]) * seconds), R)
 
 
+def test_the_covariance_of_a_twist_is_that_of_motions_with_errors():
+    """Also of a motion whose rotation and position err together, after an uncertain standstill."""
+    rng, since, own = np.random.default_rng(4), *(covariance(np.random.default_rng(seed), 0.003)
+                                                  for seed in (1, 2))
+    result = a_result(since_covariance=since, motion_covariance=own)
+    velocities = []
+    for errors in rng.multivariate_normal(np.zeros(12), np.block([
+            [since, np.zeros((6, 6))], [np.zeros((6, 6)), own]]), 20_000):
+        rest, motion = np.eye(4), result.motion.copy()
+        rest[:3, 3], rest[:3, :3] = errors[:3], rotation_exp(errors[3:6])
+        motion[:3, 3] += errors[6:9]
+        motion[:3, :3] = rotation_exp(errors[9:]) @ motion[:3, :3]
+        whole = rest @ motion
+        # Along the axes of the camera as it is estimated, to first order.
+        turned = Rotation.from_matrix(result.motion[:3, :3].T @ whole[:3, :3]).as_rotvec()
+        velocities.append(np.append(whole[:3, :3].T @ whole[:3, 3], turned) / 0.25)
+    white = np.linalg.solve(np.linalg.cholesky(twist(result)[1]), np.transpose(velocities))
+    assert np.abs(np.cov(white) - np.eye(6)).max() < 0.05
+
+
+def test_all_covariances_of_a_twist_turn_with_its_axes():
+    result = a_result(since_covariance=covariance(np.random.default_rng(1), 0.1))
+    optical, body = (twist(in_convention(result, name)) for name in ('optical', 'body'))
+    turn = np.kron(np.eye(2), [[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    assert np.allclose(body[0], turn @ optical[0])
+    assert np.allclose(body[1], turn @ optical[1] @ turn.T)
+
+
 def test_no_covariance_is_zero_infinite_or_absurd(family):
     first = a_result(since_ns=None, pose_covariance=np.zeros((6, 6)))
     message = Messages(family[0], OdometryConfig()).odometry(first)

@@ -143,6 +143,29 @@ def test_the_covariance_of_a_keyframe_edge_is_that_of_its_steps(keyframes):
     assert np.abs(np.cov(white) - np.eye(6)).max() < 0.1
 
 
+def test_an_edge_between_keyframes_with_one_reference_has_the_errors_of_both(keyframes):
+    """A frame that both were measured from, as it was kept for parallax."""
+    here, sigma = [np.eye(4), pose(x=3.0, yaw=0.2), pose(x=3.5, z=0.5, yaw=0.3)], SIGMAS
+    covariance = np.diag(sigma**2)
+    taken = [Step(10**9, Status.FIRST_FRAME, here[0])] + [
+        Step(10**9 * (i + 1), Status.OK, here[i], 10**9, here[i], covariance, True, keyframe=True)
+        for i in (1, 2)]
+    edge = keyframes(taken)[0].edges[-1]
+    rng, offs = np.random.default_rng(0), []
+    for _ in range(4000):
+        wrong = []
+        for true in here[1:]:
+            noise, metres = rng.normal(size=6) * sigma, true.copy()
+            metres[:3, 3] += noise[:3]
+            metres[:3, :3] = rotation_exp(noise[3:]) @ metres[:3, :3]
+            wrong.append(metres)
+        off = np.linalg.inv(wrong[0]) @ wrong[1]
+        offs.append([*(off[:3, 3] - edge.motion[:3, 3]),
+                     *cv2.Rodrigues(off[:3, :3] @ edge.motion[:3, :3].T)[0].ravel()])
+    white = np.linalg.solve(np.linalg.cholesky(edge.covariance), np.transpose(offs))
+    assert np.abs(np.cov(white) - np.eye(6)).max() < 0.1
+
+
 def test_common_length_error_is_removed_from_single_lengths():
     """A length known to 5 %, of which 1 % is its own error, weighs as one known to 1 %."""
     motion = pose(x=0.3, z=2.0, yaw=0.1)
@@ -422,6 +445,19 @@ def test_images_of_different_sizes_form_no_loop():
         finder.add(frame, None)
     assert any(edge.kind == 'loop' for edge in finder.loops(1))
     assert not any(edge.kind == 'loop' for edge in finder.loops(2))
+
+
+def test_keyframes_of_two_calibrations_form_no_links():
+    """A new calibration ends the correction of the one before, with the same camera matrix."""
+    cards, finder, found = Cards(), EdgeFinder(EstimatorConfig(), SlamConfig(links=2)), []
+    poses = np.array([pose(x=0.5 * i) for i in range(6)])
+    edges = chain(poses).edges
+    for i, here in enumerate(poses):
+        finder.add(cards.frame(1 + 0.1 * i, here, noise=i), edges[i - 1] if i else None,
+                   Correction(0.01, 0.01) if i < 3 else Correction())
+        found += [(edge.source, edge.target) for edge in finder.links(i)]
+        list(finder.loops(i, units=True))
+    assert found == [(0, 2), (3, 5)]
 
 
 def bonneted(frame, mask):

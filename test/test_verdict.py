@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
-from djet_ros.core.covariance import lifted_covariance, pose_difference
+from djet_ros.core.covariance import lifted_covariance, pose_difference, UNDETERMINED
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.geometry import direction_angle, epipolar_lines, fundamental, line_distances
+from djet_ros.core.geometry import (
+    direction_angle,
+    epipolar_lines,
+    fundamental,
+    line_distances,
+    unit,
+)
 from djet_ros.core.pair import Pair
-from djet_ros.core.types import Pose, RelativePose, Status
-from djet_ros.core.verdict import as_decided, as_pure_rotation, with_left_out
+from djet_ros.core.surfaces import ReprojectionSurface
+from djet_ros.core.tracking import track_jointly
+from djet_ros.core.types import Pose, RelativePose, Rival, Status
+from djet_ros.core.verdict import as_decided, as_pure_rotation, verdict, with_left_out
+from djet_ros.odometry.uncertainty import UNKNOWN_MOTION
 import numpy as np
 import pytest
 from two_view import BACKWARD, FORWARD, K, SIDEWAYS, SIZE, two_views, TwoViews, uniform_view
@@ -138,3 +148,45 @@ def test_a_rotation_leaves_the_covariance_of_noise_as_it_is() -> None:
         np.testing.assert_array_equal(turn.covariance_5, turn.own_covariance_5)
         errors.append(pose_difference(turn.R, seen.t, Pose(seen.R, seen.t)))
     assert np.linalg.norm(errors, axis=1).max() < 5e-4
+
+
+@pytest.mark.parametrize('nearly', [1.0, 0.3])
+def test_what_a_pair_claims_does_not_depend_on_the_order_of_its_rivals(nearly: float) -> None:
+    """An improbable rival widens the covariance, but does not hide an undecided one beside it."""
+    seen, y = noisy_views(7)
+    pair = pair_of(seen.x, y, Pose(seen.R, seen.t))
+    estimator = TwoViewEstimator(EstimatorConfig(method='rpe'))
+    track = track_jointly(pair, ReprojectionSurface(pair.x, y), [Pose(seen.R, seen.t)],
+                          estimator.config)
+    assert track is not None
+    aside = [Pose(seen.R, unit(np.array(seen.t) + angle * np.array([0, 0, 1])))
+             for angle in (1.0, 1.1)]
+    rivals = Rival(aside[0], 3.0), Rival(aside[1], nearly)
+    claims = [verdict(pair, replace(track, rivals=order), estimator.config)
+              for order in (rivals, rivals[::-1])]
+    assert [claim.status for claim in claims] == [Status.AMBIGUOUS] * 2
+    np.testing.assert_array_equal(claims[0].covariance_5, claims[1].covariance_5)
+
+
+def test_a_rival_of_opposite_sign_is_as_uncertain_as_the_one_of_the_nearer_sign() -> None:
+    seen, y = noisy_views(8)
+    pair = pair_of(seen.x, y, Pose(seen.R, seen.t))
+    config = EstimatorConfig(method='rpe')
+    track = track_jointly(pair, ReprojectionSurface(pair.x, y), [Pose(seen.R, seen.t)], config)
+    assert track is not None
+    aside = unit(np.array(seen.t) + 0.02 * np.array([0, 0.5, 1]))
+    one, other = (verdict(pair, replace(track, rivals=(Rival(Pose(seen.R, sign * aside), 1.0),)),
+                          config) for sign in (1, -1))
+    np.testing.assert_allclose(other.covariance_5, one.covariance_5, rtol=1e-6, atol=1e-12)
+
+
+def test_residuals_of_a_pure_rotation_are_those_of_its_rotation() -> None:
+    seen, y = noisy_views(3)
+    motion = estimate(pair_of(seen.x, y))
+    turn = as_pure_rotation(motion, K)
+    lines = epipolar_lines(fundamental(K, turn.R, motion.t), seen.x)
+    np.testing.assert_allclose(turn.residuals, line_distances(lines, y))
+
+
+def test_covariances_that_results_share_cannot_be_changed_through_one_of_them() -> None:
+    assert not any(shared.flags.writeable for shared in (*UNDETERMINED, UNKNOWN_MOTION))

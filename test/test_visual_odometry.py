@@ -8,7 +8,9 @@ from djet_ros.core.correction import Correction
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import direction_angle, rotation_angle, rotation_exp, unit
+from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import RelativePose, Status
+from djet_ros.core.verdict import as_undecided
 from djet_ros.errors import DjetError
 from djet_ros.lab.scenes import make_scene
 from djet_ros.odometry.frame import Frame
@@ -366,6 +368,68 @@ def test_a_gap_begins_a_new_reference_at_the_last_pose(cards):
     assert after.relative is None
     assert np.array_equal(after.pose, before.pose)
     assert np.diag(after.pose_covariance).min() > 1
+
+
+def test_a_camera_may_have_started_to_move_in_a_gap(cards):
+    """That it stood before, and which features did, tells nothing of it then."""
+    sideways = [pose(x=0.06)] * 12
+    for gap, size in ((1.5, 0), (0.1, 2)):
+        vo = odometry(max_gap=1.0)
+        assert drive(vo, cards, [np.eye(4)] * 5)[-1].stationary
+        here, statuses = pose(x=1.0), []
+        for i, step in enumerate(sideways):
+            here = here @ step
+            frame = cards.frame(0.4 + gap + 0.1 * i, here)
+            frame = replace(frame, gray=frame.gray[:, size:].copy())
+            statuses.append(vo.process(frame).status)
+        assert statuses[0] in (Status.TIME_JUMP, Status.SIZE_CHANGED)
+        assert statuses[1:] == [Status.OK] * 11
+
+
+def test_what_is_attached_to_a_camera_is_not_to_another_one(cards):
+    vo = odometry()
+    drive(vo, cards, [np.eye(4), STEP])
+    vo._standstill._attached = np.array([1 + 1j])
+    vo.process(cards.frame(5.0))
+    assert len(vo._standstill._attached)
+    frame = cards.frame(5.1)
+    vo.process(replace(frame, gray=frame.gray[:-2].copy()))
+    assert not len(vo._standstill._attached)
+
+
+def test_another_calibration_ends_the_evidence_about_the_one_before(cards):
+    vo = odometry()
+    drive(vo, cards, [np.eye(4), *[STEP] * 30])
+    unknown = SelfCalibration.unknown(K, vo._reference.view.gray.shape)
+    assert not np.allclose(vo._scale._window.calibration.covariance, unknown.covariance)
+    assert not any(vo.estimator.correction)
+    vo.recalibrated()
+    assert np.array_equal(vo._scale._window.calibration.covariance, unknown.covariance)
+
+
+def test_a_pair_that_is_rejected_teaches_neither_gyro_nor_scale(cards, monkeypatch):
+    """What has taken over the view would be measured, not the camera."""
+    gyro, scale = gyro_of([0, 0.1, 0]), Observing()
+    vo = VisualOdometry(ESTIMATOR, OdometryConfig(), scale, gyro)
+    drive(vo, cards, [np.eye(4), *[STEP] * 5])
+    known, seen = gyro.bias_covariance.copy(), scale.seen
+    assert seen == 5
+    monkeypatch.setattr(vo._takeover, 'judged',
+                        lambda before, pair, stamp: as_undecided(pair, Status.TWO_MOTIONS))
+    result = vo.process(cards.frame(0.6, np.linalg.matrix_power(STEP, 6)))
+    assert result.status is Status.TWO_MOTIONS
+    assert np.array_equal(gyro.bias_covariance, known) and scale.seen == seen
+
+
+class Observing(ConstantScale):
+    """A length of one that counts the pairs it has seen."""
+
+    def __init__(self):
+        super().__init__(1.0)
+        self.seen = 0
+
+    def observe(self, *pair):
+        self.seen += 1
 
 
 def test_standing_still_for_long_is_no_gap(cards):

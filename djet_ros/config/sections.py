@@ -38,8 +38,9 @@ class OdometryConfig:
         3, 'consecutive failed pairs after which the newest frame replaces the reference frame',
         minimum=1, maximum=1000)
     standstill: float = parameter(
-        0.3, 'median displacement of the matches, in pixels, below which the camera is stationary '
-        'and the reference frame is kept', minimum=0.0, maximum=10.0)
+        0.3, 'displacement in pixels below which a match is still; the camera is stationary, and '
+        'the reference frame is kept, if most matches are, or those that stood before',
+        minimum=0.0, maximum=10.0)
     scale: str = parameter(
         'structure', 'source of the translation length: structure (relative scale, propagated by '
         'landmarks that frames share), none (unit length), constant (scale_value), speed (speed '

@@ -272,7 +272,7 @@ class Algorithm:
         Match culling: a keypoint without a surface is dropped, and keeps its last loss.
         """
         self._alive = self._alive & paraboloids.usable
-        # Outside of the window a minimum is extrapolated.
+        # Far from the sampled pixels a minimum is extrapolated.
         within = (paraboloids.minimum_within(self.config.window // 2)
                   | (not self.config.cull_outside))
         return np.asarray(self._alive & self._plausible & self._on_motion & within)

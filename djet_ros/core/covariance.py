@@ -64,6 +64,8 @@ _MIN_VARIANCE = 1e-18
 
 # Covariances of a pose that is not determined.
 UNDETERMINED = np.full((5, 5), np.nan), np.full((6, 6), np.nan)
+for _unknown in UNDETERMINED:
+    _unknown.setflags(write=False)  # results share them
 
 # Share of the information in any direction of the pose that has to remain without the matches of
 # one cell.
@@ -113,7 +115,8 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     noise = float((weights * squared).sum() / weights.sum())
     covariance = independent + _correlated(pulls, products, cells.inverse, independent, size,
                                            noise)
-    growth = float(np.trace(np.linalg.solve(independent, covariance))) / 5
+    # By rounding it may be less, if a direction is hardly determined.
+    growth = max(float(np.trace(np.linalg.solve(independent, covariance))) / 5, 1.0)
     covariance += growth * size * _small_sample_widening(cells, growth)
     # Ratio of the step of a pose to that by H, in which the loss counts by its weights.
     flattened = np.linalg.solve(curved, H)
@@ -154,14 +157,14 @@ def widened_by_profile(covariance: Array, problem: JetProblem, pose: Pose, loss:
 
 
 def calibration_covariance(problem: JetProblem, K: Array, pose: Pose, residuals: Residuals,
-                           loss: Loss, sigma: float) -> Array:
+                           loss: Loss, sigma: float, flipped: bool) -> Array:
     """
     Return the covariance (6, 6) over (rotation vector, t) due to errors of the camera matrix.
 
     residuals: those at the pose; sigma: standard deviation in pixels of the focal length (common
-    to fx and fy), and of each coordinate of the principal point. If one of these is off by dk,
-    residuals change by dr, and weighted least squares shifts the pose by -(J W J^T)^-1 J W dr
-    (implicit function theorem at the minimum).
+    to fx and fy), and of each coordinate of the principal point; flipped: whether t is opposite to
+    that of the pose. If one of these is off by dk, residuals change by dr, and weighted least
+    squares shifts the pose by -(J W J^T)^-1 J W dr (implicit function theorem at the minimum).
     """
     J = residuals.jacobian
     weighted = J * loss(residuals.r**2)[1]
@@ -170,7 +173,7 @@ def calibration_covariance(problem: JetProblem, K: Array, pose: Pose, residuals:
     changes = [epipolar_residuals(problem.with_camera(K, K + step), pose.R, pose.t).r - residuals.r
                for step in steps]
     shifts = np.linalg.solve(weighted @ J.T, weighted @ np.transpose(changes))
-    lifted = lift(residuals.tangents) @ shifts
+    lifted = lift(-residuals.tangents if flipped else residuals.tangents) @ shifts
     return np.asarray(lifted @ lifted.T)
 
 

@@ -229,10 +229,13 @@ class TwoViewEstimator:
         start: that motion, such as a rival that other evidence has decided for; known: as for
         ``estimate``.
         """
-        return self.estimate_pair(Pair(
+        pair, kept = Pair(
             previous, current, relative.x, relative.y, PreviousMotion(start.R, start.t),
             known or KnownMotion(), start=start, sought=relative.sought,
-            timings=relative.timings))
+            timings=relative.timings), relative.of_body
+        result = self.estimate_pair(pair.of(kept))
+        whole = len(result.x) == kept.sum() < len(kept)
+        return with_left_out(result, pair, kept) if whole else result
 
     def estimate_pair(self, pair: Pair) -> RelativePose:
         """Estimate the motion of a ``Pair``: its matches and all prior knowledge."""

@@ -25,7 +25,7 @@ class EstimatorConfig:
         'djet', 'residual surface: djet (descriptors), pjet (intensities), rpe (re-projection), '
         'or five_point (the start alone)', choices=METHODS)
     max_features: int = parameter(
-        2000, 'features detected per image; an eighth more if views are far apart',
+        2000, 'features detected per image, approximately; a quarter more if views are far apart',
         minimum=8, maximum=20000)
     detector: str = parameter(
         'corners', 'feature detector: corners (evenly distributed, three sizes, unrotated '
@@ -50,7 +50,8 @@ class EstimatorConfig:
         'homographies, previous motion, pure forward motion; all matches)',
         choices=('several', 'five_point'))
     window: int = parameter(
-        5, 'side of the square in which a residual surface is sampled, in pixels',
+        5, 'side of the square in which a residual surface is sampled, in pixels; if the reference is '
+        'warped, 3',
         minimum=3, maximum=15, odd=True)
     window_sigma: float = parameter(
         1.0, 'standard deviation of the Gaussian weights of the samples in the quadratic fit, in '
@@ -74,7 +75,8 @@ class EstimatorConfig:
         'project', 'surfaces without a minimum: project (onto the positive cone), drop (the '
         'match), or keep (as printed)', choices=('project', 'drop', 'keep'))
     cull_outside: bool = parameter(
-        True, 'leave out matches whose surface has its minimum outside the sampled window')
+        True, 'leave out matches whose surface has its minimum farther than half a window from where '
+        'it was sampled')
     weigh_by_fit: bool = parameter(
         True, 'weight each match by the residual that remains at the minimum of its surface')
     # chosen: 5, about a window. Closer to the epipole, a match that fits by chance would fix the

@@ -85,7 +85,7 @@ class JetProblem:
         A = inverse_intrinsics(other) @ K
         return JetProblem(A @ self.rays_x, A @ self.rays_y,
                           ray_covariances(inverse_intrinsics(K) @ other, self.covariances),
-                          np.linalg.det(A) * self.blur)
+                          np.linalg.det(A)**2 * self.blur)
 
     @property
     def matches(self) -> tuple[Array, Array, Array, Array]:

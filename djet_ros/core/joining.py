@@ -76,7 +76,7 @@ def fuse(differences: Array, S: Array, T: Array) -> tuple[Array, Array]:
     """
     Fuse two measurements of N positions: by surfaces, with S (3, N), and by alignment, with T.
 
-    Covariances are given as entries 11, 12, 22; apart: (2, N) from the former to the latter.
+    Covariances are given as entries 11, 12, 22; differences: (2, N) from the former to the latter.
     Returns the displacement (2, N) from the former to the fused position, and its covariance (3,
     N), scaled by the noise of each match.
     """

@@ -105,7 +105,8 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
     determined = bool(np.isfinite(covariance).all())
     if config.calibration_sigma and determined:
         calibration = calibration_covariance(
-            track.problem, K, track.pose, track.residuals, track.loss, config.calibration_sigma)
+            track.problem, K, track.pose, track.residuals, track.loss, config.calibration_sigma,
+            flipped=sign < 0)
         covariance, own_covariance = (widened(each, pose.t, calibration)
                                       for each in (covariance, own_covariance))
     covariance_6 = lifted_covariance(covariance, pose.t) if determined else UNDETERMINED[1]
@@ -176,8 +177,9 @@ def as_pure_rotation(relative: RelativePose, K: Array) -> RelativePose:
     agree = relative.inliers
     R = fit_rotation(rays(K, relative.x[agree]), rays(K, relative.placed[agree]))
     covariance = _widened_by_rotation(relative.covariance_5, relative.R, R)
+    lines = epipolar_lines(fundamental(K, R, relative.t), relative.x)
     return replace(relative, status=Status.NO_PARALLAX, R=R, t=np.zeros(3),
-                   covariance_5=covariance,
+                   residuals=line_distances(lines, relative.y), covariance_5=covariance,
                    covariance_6=lifted_covariance(covariance, relative.t))
 
 
@@ -247,11 +249,12 @@ def _compare_with_rivals(pose: Pose, covariance: Array, track: Track, x: Array,
     rival is ignored, unless two bodies move: with a motion 60 degrees away, a probability of six
     in a thousand turns a standard deviation of a fifth of a degree into one of five degrees.
     Should a possible rival be true, errors beside the line that spans it are as large as its own
-    covariance says, so that is added.
+    covariance says, so that is added. The likeliest come first, so that the widening by an
+    improbable one does not cover them.
     """
     status = Status.TWO_MOTIONS if track.body_ambiguous else Status.OK
     possible: list[Rival] = []
-    for rival in (*track.rivals, *track.nearby):
+    for rival in sorted((*track.rivals, *track.nearby), key=lambda rival: rival.preference):
         offset = pose_difference(pose.R, pose.t, rival.pose)
         if is_within(covariance, offset):
             continue
@@ -266,7 +269,7 @@ def _compare_with_rivals(pose: Pose, covariance: Array, track: Track, x: Array,
     # Only after all rivals were compared: the uncertainty of one rival must not make another one
     # look covered.
     for rival in possible:
-        covariance = widened(covariance, pose.t, _covariance_of(rival.pose, track, x))
+        covariance = widened(covariance, pose.t, _covariance_of(rival.pose, track, x, pose.t))
     if sign_open:
         status = status if track.body_ambiguous else Status.AMBIGUOUS
         covariance = _of_any_direction(covariance)
@@ -289,11 +292,16 @@ def _may_stand(pair: Pair, track: Track, pose: Pose, least: int) -> bool:
                      track.surface_noise, least, pair.prior)
 
 
-def _covariance_of(pose: Pose, track: Track, x: Array) -> Array:
-    """Return the covariance (6, 6) of a rival, from its residuals on the track's surfaces."""
+def _covariance_of(pose: Pose, track: Track, x: Array, t: Array) -> Array:
+    """
+    Return the covariance (6, 6) of a rival, from its residuals on the track's surfaces.
+
+    t: (3,) direction that it is compared with: of the rival's two signs the nearer one counts.
+    """
     residuals = epipolar_residuals(track.problem, pose.R, pose.t)
-    return pose_covariance(residuals, track.loss, x.compress(track.voting, axis=0), pose.t,
-                           flipped=False)[1]
+    flipped = bool(pose.t @ t < 0)
+    return pose_covariance(residuals, track.loss, x.compress(track.voting, axis=0),
+                           -pose.t if flipped else pose.t, flipped)[1]
 
 
 def _prior_decides(prior: Pose | None, pose: Pose, rival: Pose) -> bool:

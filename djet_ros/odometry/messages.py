@@ -21,7 +21,7 @@ from djet_ros.errors import DjetError
 from djet_ros.odometry.mounting import pose_of_base, twist_of_base
 from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.scale import Scale, UNKNOWN_LENGTH_SIGMA
-from djet_ros.odometry.uncertainty import compose, rotated
+from djet_ros.odometry.uncertainty import compose, of_inverse, rotated
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -110,7 +110,8 @@ def in_convention(result: OdometryResult, convention: str) -> OdometryResult:
     C[:3, :3] = OPTICAL_TO_BODY
     return replace(result, motion=C @ result.motion @ C.T, pose=C @ result.pose @ C.T,
                    motion_covariance=rotated(OPTICAL_TO_BODY, result.motion_covariance),
-                   pose_covariance=rotated(OPTICAL_TO_BODY, result.pose_covariance))
+                   pose_covariance=rotated(OPTICAL_TO_BODY, result.pose_covariance),
+                   since_covariance=rotated(OPTICAL_TO_BODY, result.since_covariance))
 
 
 def camera_frame(config: OdometryConfig, image_frame: str) -> str:
@@ -418,12 +419,12 @@ def twist(result: OdometryResult) -> tuple[Array, Array]:
     if result.since_ns is None or result.status not in TRACKED:
         return unknown_twist()
     seconds = (result.stamp_ns - result.since_ns) * 1e-9
-    R = result.motion[:3, :3]
-    velocity = np.concatenate([R.T @ result.motion[:3, 3],
-                               Rotation.from_matrix(R).as_rotvec()]) / seconds
+    R, p = result.motion[:3, :3], result.motion[:3, 3]
+    velocity = np.concatenate([R.T @ p, Rotation.from_matrix(R).as_rotvec()]) / seconds
     covariance = compose(np.eye(4), result.since_covariance, result.motion,
                          result.motion_covariance)
-    return velocity, rotated(R.T, covariance) / seconds**2
+    # The velocity R^T p is opposite to the translation of the inverse motion.
+    return velocity, of_inverse(result.motion, covariance) / seconds**2
 
 
 def unknown_twist() -> tuple[Array, Array]:

@@ -35,6 +35,8 @@ class MotionPriors:
         self.gyro: Gyro | None = None
         self.guess: Guess | None = None
         self.known_ns = 0
+        # The rotation (3, 3) of the newest pair that agreed with the gyro, and its covariance.
+        self._by_images: tuple[Array, Array] | None = None
         self.refer(0)
 
     def refer(self, stamp_ns: int) -> None:
@@ -80,25 +82,31 @@ class MotionPriors:
             self.gyro.judge(agreed)
         return agreed
 
-    def fuse(self, relative: RelativePose, prior: MeasuredRotation | None, span_ns: Span,
-             learn: bool) -> RelativePose:
+    def fuse(self, relative: RelativePose, prior: MeasuredRotation | None, span_ns: Span
+             ) -> RelativePose:
         """
         Return the pair fused with the gyro's rotation; DEGENERATE if both disagree.
 
         prior: the rotation that was its prior; None if the gyro is not trusted: then the gyro is
-        judged, and the pair stays as it is; learn: whether to estimate the bias from the pair.
+        judged, and the pair stays as it is.
         """
+        self._by_images = None
         turn = prior or self._turn(span_ns)
         if self.gyro is None or turn is None or relative.status not in TRACKED:
             return relative
         agreed = self.judge(turn, relative)
-        if agreed and learn:
-            self._learn(self.gyro, span_ns[1], relative.R, relative.covariance_6[:3, :3])
+        if agreed:
+            self._by_images = relative.R, relative.covariance_6[:3, :3]
         if prior is None:
             return relative
         # The camera did not turn like this: something else fills the image.
         return fused(relative, prior) if agreed else replace(
             relative, status=Status.DEGENERATE, t=np.zeros(3))
+
+    def learn(self, stamp_ns: int) -> None:
+        """Estimate the gyro's bias from the pair fused last, up to a frame, if both agreed."""
+        if self.gyro is not None and self._by_images is not None:
+            self._learn(self.gyro, stamp_ns, *self._by_images)
 
     def learn_at_rest(self, stamp_ns: int) -> None:
         """Estimate the gyro's bias from a standstill up to a frame."""

@@ -63,6 +63,12 @@ class Standstill:
         # The most matches that were still, and pairs in a row in which half of them were not.
         self._most = self._hidden = 0
 
+    def interrupt(self, other_camera: bool) -> None:
+        """Note a gap, after which the camera may move or stand, or images of another camera."""
+        self._stood = None
+        if other_camera:
+            self._attached = self._attached[:0]
+
     def stay(self, relative: RelativePose, threshold: float) -> None:
         """Note that the camera stood still in a pair, and which features did."""
         self._stood = True

@@ -26,6 +26,7 @@ _LEAST_SIGMA = 1e-3
 
 # Covariance (6, 6) of an unknown motion.
 UNKNOWN_MOTION = np.diag([UNKNOWN_LENGTH_SIGMA**2] * 3 + [_UNKNOWN_ANGLE**2] * 3)
+UNKNOWN_MOTION.setflags(write=False)  # results share it
 
 
 def motion_covariance(relative: RelativePose, length: Length) -> Array:
@@ -167,6 +168,15 @@ def block_rotation(R: Array) -> Array:
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = R
     return turn
+
+
+def of_inverse(motion: Array, covariance: Array) -> Array:
+    """Return the covariance (6, 6) of the inverse of a motion (4, 4) with a covariance."""
+    # (R^T, -R^T p) with p + dp and exp(dtheta) R.
+    R, p = motion[:3, :3], motion[:3, 3]
+    J = np.zeros((6, 6))
+    J[:3, :3], J[:3, 3:], J[3:, 3:] = R.T, R.T @ skew(p), R.T
+    return symmetric(J @ covariance @ J.T)
 
 
 def symmetric(covariance: Array) -> Array:

@@ -105,7 +105,8 @@ class VisualOdometry:
 
     def recalibrated(self) -> None:
         """Forget what was wrong with the calibration, as the next images have another one."""
-        if self._last is not None and self._forget_correction():
+        self._forget_correction()
+        if self._last is not None:
             self._renew_reference_view()
             self._scale.begin(self._reference.view)
 
@@ -164,7 +165,7 @@ class VisualOdometry:
         if view is None:
             view = frame.view(self._estimator)
         if status is not Status.OK:
-            return self._started(frame, view, status, backwards)
+            return self._started(frame, view, status, backwards, other_camera)
         # Estimate the relative pose; first as if the camera stood still, if it may have until now.
         reference = self._reference
         span = reference.since_ns, frame.stamp_ns
@@ -175,11 +176,11 @@ class VisualOdometry:
         else:
             pair = self._estimated(view, priors)
             stands = self._stands(pair, at_rest)
-        self._scale_source.observe(*span, reference.view, view, pair)
         # Back at a reference that was kept the camera does not stand: it swings, or has just
         # stopped.
         returned, self._waited = stands and self._waited, False
         if stands and not returned:
+            self._scale_source.observe(*span, reference.view, view, pair)
             return self._stationary(frame, pair, span)
         # Verify the pair by the landmarks' depths and the gyro, and fuse the gyro's rotation.
         pair = self._takeover.judged(reference.pair, self._verified(view, pair, priors, span),
@@ -189,6 +190,11 @@ class VisualOdometry:
             pair = as_undecided(pair)
         if pair.status not in TRACKED:
             return self._lost(frame, view, pair, span, may_stand and self._standstill.stood)
+        # The gyro and the metric source learn from it. What bridges bad pairs may be the motion of
+        # what made them bad: it calibrates no gyro.
+        if not self._bad_pairs:
+            self._priors.learn(frame.stamp_ns)
+        self._scale_source.observe(*span, reference.view, view, pair)
         # Estimate the length of its translation, and integrate it.
         self._waited = not returned and self._waits_for_parallax(pair, span)
         return self._tracked(frame, view, pair, span)
@@ -244,8 +250,7 @@ class VisualOdometry:
             if alone.status in TRACKED:
                 self._priors.judge(priors.rotation, alone)
         pair = self._scale.verified(pair, self._reference.view.K)
-        # What bridges bad pairs may be the motion of what made them bad: it calibrates no gyro.
-        return self._priors.fuse(pair, priors.rotation, span, learn=not self._bad_pairs)
+        return self._priors.fuse(pair, priors.rotation, span)
 
     def _may_stand(self, standing: RelativePose, span: Span, at_rest: bool | None) -> bool:
         """
@@ -269,8 +274,8 @@ class VisualOdometry:
         return (turns(pair, self._reference.view.K, self._config.standstill)
                 and not self._standstill.is_of_others(pair))
 
-    def _started(self, frame: Frame, view: View, status: Status,
-                 backwards: bool) -> OdometryResult:
+    def _started(self, frame: Frame, view: View, status: Status, backwards: bool,
+                 other_camera: bool) -> OdometryResult:
         """Begin a new reference: at the origin, or at the last pose after an unknown motion."""
         if backwards:
             self._scale_source.go_back(frame.stamp_ns)
@@ -283,6 +288,7 @@ class VisualOdometry:
             self._priors.known_ns = frame.stamp_ns
         self._refer_to(frame, view, None)
         self._scale.begin(view)
+        self._standstill.interrupt(other_camera)
         self._takeover.forget()
         self._last_pair, self._bad_pairs = None, 0
         return OdometryResult.without_pair(

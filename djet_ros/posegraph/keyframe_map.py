@@ -11,7 +11,7 @@ from djet_ros.config.sections import Config, SlamConfig
 from djet_ros.core.correction import Correction
 from djet_ros.core.types import Array
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.uncertainty import compose, rotated
+from djet_ros.odometry.uncertainty import compose, of_inverse, rotated
 from djet_ros.posegraph.backend import optimise, OptimisedGraph
 from djet_ros.posegraph.keyframe_images import KeyframeImage
 from djet_ros.posegraph.loops import EdgeFinder
@@ -70,6 +70,14 @@ class KeyframeOffset(Motion):
                               compose(self.motion, self.covariance, step.motion, covariance),
                               self.scale_known and step.scale_known, self.known,
                               self.uncorrelated + R @ own @ R.T)
+
+    def before(self, step: Step, config: SlamConfig, uncertainty: float) -> KeyframeOffset:
+        """Return the offset of the frame before a keyframe, from the step to it."""
+        step_alone = KeyframeOffset(self.keyframe).then(step, config, uncertainty)
+        R = step.motion[:3, :3]
+        return replace(step_alone, motion=np.asarray(np.linalg.inv(step.motion)),
+                       covariance=of_inverse(step.motion, step_alone.covariance),
+                       uncorrelated=R.T @ step_alone.uncorrelated @ R)
 
     def guessed(self, motion: Array, covariance: Array) -> KeyframeOffset:
         """Return the offset of the next frame, from a guess (4, 4) with covariance (6, 6)."""
@@ -177,7 +185,7 @@ class KeyframeMap:
             # The reference may remain that of the next step: then the camera was stationary, and
             # this keyframe serves both frames.
             self._offsets[step.previous_stamp_ns] = reference if frame is None else \
-                KeyframeOffset(offset.keyframe, np.asarray(np.linalg.inv(step.motion)))
+                offset.before(step, self._slam, self._uncertainty)
         self.newest, self._newest_step = offset, step
 
     def _is_keyframe(self, step: Step, offset: KeyframeOffset | None) -> bool:

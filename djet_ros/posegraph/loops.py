@@ -103,8 +103,10 @@ class EdgeFinder:
 
     def _link(self, current: int, previous: int, guess: float) -> Iterator[Edge]:
         correction = self._correction(current)
-        relative = self._near.estimate(self._view(previous, correction),
-                                       self._view(current, correction))
+        view, other = self._view(previous, correction), self._view(current, correction)
+        if not of_same_camera(view, other):
+            return
+        relative = self._near.estimate(view, other)
         if relative.status is Status.OK and self._is_verified(relative):
             yield _edge(previous, current, relative, unknown(guess), 'link')
 
@@ -151,14 +153,20 @@ class EdgeFinder:
             return None
         back = self._back(number, step.source, correction)
         length = float(np.linalg.norm(step.motion[:3, 3]))
-        return (back, length) if back.status is Status.OK and length else None
+        return (back, length) if back is not None and back.status is Status.OK and length else None
 
-    def _back(self, number: int, neighbour: int, correction: Correction) -> RelativePose:
-        """Estimate the motion back to the predecessor; cached for the newest keyframe."""
+    def _back(self, number: int, neighbour: int, correction: Correction) -> RelativePose | None:
+        """
+        Estimate the motion back to the predecessor; None if that is of another camera.
+
+        Cached for the newest keyframe.
+        """
         if self._newest is not None and self._newest[0] == number:
             return self._newest[1]
-        back = self._near.estimate(self._view(number, correction),
-                                   self._view(neighbour, correction))
+        view, other = self._view(number, correction), self._view(neighbour, correction)
+        if not of_same_camera(view, other):
+            return None
+        back = self._near.estimate(view, other)
         if number == self._first + len(self._times) - 1:
             self._newest = number, back
         return back
