@@ -182,6 +182,7 @@ class Camera:
             seen = (np.abs(x - (width - 1) / 2) <= width / 2) \
                 & (np.abs(y - (height - 1) / 2) <= height / 2)
             unseen = ~seen | folded
+            unseen.setflags(write=False)  # all frames share it
             self._undistorting = _Undistortion(shape, maps, unseen if unseen.any() else None)
         return self._undistorting
 

@@ -84,4 +84,6 @@ def _undistorted(mask: NDArray[np.bool_], shape: tuple[int, ...], camera: Camera
         raise BadMessage('mask_size', f'{what} has {mask.shape[1]}x{mask.shape[0]} pixels, the '
                          f'image {shape[1]}x{shape[0]}; both must have the same size')
     # A pixel interpolated from any ignored one is ignored.
-    return np.asarray(camera.undistort(np.where(mask, 255, 0).astype(np.uint8)) > 0)
+    ignored = np.asarray(camera.undistort(np.where(mask, 255, 0).astype(np.uint8)) > 0)
+    ignored.setflags(write=False)  # all frames may share it
+    return ignored
