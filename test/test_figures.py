@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import os
 from pathlib import Path
 import subprocess
@@ -65,6 +66,15 @@ def test_points_are_found_again_in_a_shifted_image(gray):
     for index in np.flatnonzero(right):
         x, y = missing[index]
         assert found.surfaces[12 + y, 12 + x, index] == 0
+
+
+def test_matches_of_additional_features_are_taken_too(gray):
+    # In an image with more corners than are sought, some features are detected on demand.
+    few = replace(CONFIG, max_features=300)
+    features = TwoViewEstimator(few).view(gray, np.eye(3)).features
+    assert len(features) < len(features.with_additional)
+    found = cross_similarity(gray, np.roll(gray, (2, 5), axis=(0, 1)), None, 40, 12, few)
+    assert len(found.x) == 40
 
 
 def test_the_strongest_keypoints_are_taken_and_kept_apart(gray):
