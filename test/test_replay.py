@@ -679,6 +679,7 @@ def test_recording_without_tracked_pairs_gives_a_warning(tmp_path):
     found = summary(tmp_path / 'out')
     assert (found['positions'], found['drift']) == (None, None)
     assert found['failures'] == FRAMES - 1
+    assert found['scale_kind'] == 'unknown'
 
 
 def test_a_recording_of_one_image_gives_a_warning(tmp_path):
