@@ -778,15 +778,20 @@ def test_bad_first_image_is_named_and_does_not_change_the_other_poses(bad, tmp_p
         tmp_path / 'without' / 'trajectory_tum.txt').read_bytes()
 
 
-@pytest.mark.parametrize('at', [0, 3])
-def test_damaged_image_file_is_counted_like_a_bad_image_of_a_bag(at, folder, tmp_path):
+@pytest.mark.parametrize(('at', 'left', 'why'), [
+    (0, 500, 'PNG image of 500 bytes is cut short'),
+    (3, 500, 'PNG image of 500 bytes is cut short'),
+    (3, 20, 'PNG image of 20 bytes is cut short'), (0, 0, 'compressed image is empty'),
+    (FRAMES - 1, 0, 'compressed image is empty')])
+def test_damaged_image_file_is_counted_like_a_bad_image_of_a_bag(
+        at, left, why, folder, tmp_path):
     shutil.copytree(folder, tmp_path / '00')
     cut = tmp_path / '00' / 'image_0' / f'{at:06d}.png'
-    cut.write_bytes(cut.read_bytes()[:500])
+    cut.write_bytes(cut.read_bytes()[:left])
     printed = djet('replay', tmp_path / '00', '--output', tmp_path / 'r', expect=2).stderr
     assert printed == (
         f'djet: error: {tmp_path / "00"}: 1 of {FRAMES} images could not be used; image {at}: '
-        'PNG image of 500 bytes is cut short\n')
+        f'{why}\n')
     found = summary(tmp_path / 'r')
     assert (found['complete'], found['frames']) == (True, FRAMES - 1)
     assert found['rejected'] == {'undecodable': 1}
