@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 import os
 from pathlib import Path
@@ -12,8 +14,10 @@ from djet_ros.cli.main import main
 from djet_ros.config.sections import Config
 from djet_ros.errors import DjetError
 from djet_ros.lab.store import FILE_NAME, RecordStore
+from djet_ros.lab.style import figure
 from djet_ros.recordings.outputs import write_whole
-from djet_ros.replay.results import ResultsFolder
+from djet_ros.replay.results import plot_trajectory, ResultsFolder
+import numpy as np
 import pytest
 
 
@@ -22,6 +26,17 @@ class Count:
     """The plainest record."""
 
     number: int
+
+
+@contextmanager
+def full_disk() -> Iterator[None]:
+    """Let this process write no file beyond ten bytes, as on a full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def held(folder: Path) -> dict[str, str]:
@@ -57,20 +72,28 @@ def test_a_file_that_can_not_be_written_leaves_nothing_behind(tmp_path: Path) ->
     assert [path.name for path in tmp_path.iterdir()] == ['folder']
 
 
+def test_a_figure_that_can_not_be_written_leaves_the_earlier_one_and_is_named(
+        tmp_path: Path) -> None:
+    path = tmp_path / 'plot.png'
+    path.write_bytes(b'earlier')
+    with full_disk(), pytest.raises(OSError, match='File too large') as caught, \
+            figure(path, 3, 3):
+        pass
+    assert caught.value.filename == str(path)
+    with full_disk(), pytest.raises(DjetError, match='plot.png could not be written: File too'):
+        plot_trajectory(path, np.zeros((2, 3)), None, np.empty((0, 2), np.float32), 'none', 'm')
+    assert held(tmp_path) == {'plot.png': 'earlier'}
+
+
 @pytest.mark.parametrize('present', [False, True])
 def test_results_that_cannot_be_started_leave_the_folder_unchanged(
         present: bool, tmp_path: Path) -> None:
     place = tmp_path / 'results'
     if present:
         place.mkdir()
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    # As on a full disk.
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
-    try:
-        with pytest.raises(DjetError, match='results could not be created: File too large'):
-            ResultsFolder(place, Config())
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with full_disk(), pytest.raises(DjetError,
+                                    match='results could not be created: File too large'):
+        ResultsFolder(place, Config())
     assert list(tmp_path.rglob('*')) == ([place] if present else [])
     ResultsFolder(place, Config()).close()
 

@@ -78,13 +78,28 @@ def _check_obstacles(folder: Path) -> None:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write or replace a text file atomically. Raises OSError."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # A new file in a temporary folder, not a temporary file: its mode follows the umask.
-    with TemporaryDirectory(prefix='.djet-', dir=path.parent) as scratch:
-        new = Path(scratch) / 'new'
+    """Write or replace a text file atomically. Raises OSError that names it."""
+    with replaced_whole(path) as new:
         new.write_text(text, 'utf-8')
-        os.replace(new, path)
+
+
+@contextmanager
+def replaced_whole(path: Path) -> Iterator[Path]:
+    """
+    Yield a path in a temporary folder, of a file that is to be ``path``; on failure that is kept.
+
+    The file has the suffix of ``path``. Raises OSError that names ``path``.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # A new file in a temporary folder, not a temporary file: its mode follows the umask.
+        with TemporaryDirectory(prefix='.djet-', dir=path.parent) as scratch:
+            new = Path(scratch) / f'new{path.suffix}'
+            yield new
+            os.replace(new, path)
+    except OSError as error:
+        # The temporary file means nothing to the user, and a full disk names none.
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
 
 
 @contextmanager

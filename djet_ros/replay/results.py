@@ -35,7 +35,7 @@ from djet_ros.odometry.tracker import Outgoing
 from djet_ros.posegraph.steps import Step
 from djet_ros.recordings.bag_writers import ResultBag
 from djet_ros.recordings.closing import Closing
-from djet_ros.recordings.outputs import make_room, write_whole
+from djet_ros.recordings.outputs import make_room, replaced_whole, write_whole
 from djet_ros.recordings.point_clouds import PointFile
 from djet_ros.recordings.text import LineFile
 from djet_ros.recordings.trajectories import KittiWriter, TumWriter
@@ -268,6 +268,7 @@ def plot_trajectory(path: Path, estimate: Array, truth: Array | None,
     axes.grid(color='0.9')
     axes.legend(loc='best')
     try:
-        figure.savefig(path, dpi=120)
+        with replaced_whole(path) as new:
+            figure.savefig(new, dpi=120)
     except OSError as error:
         raise _blame(path, error) from error
