@@ -111,6 +111,24 @@ def test_figures_are_json_and_their_plot_replaces_no_other_image(
     assert held(tmp_path) == {'f.png': 'my photo'}
 
 
+@pytest.mark.parametrize('verb', [
+    ('bench', 'sequence'), ('closure', 'sequence'), ('soak', '--frames', '100')])
+def test_figures_without_a_place_are_refused_before_they_are_measured(
+        verb: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    # No mode holds root back, but nobody creates files there.
+    assert main(['lab', *verb, '--output', '/proc/f.json']) == 2
+    assert capsys.readouterr().err.startswith('djet: error: /proc/f.json could not be created: ')
+
+
+def test_figures_that_find_a_full_disk_are_named(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / 'f.json'
+    with full_disk():
+        assert main(['lab', 'soak', '--frames', '100', '--output', str(output)]) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == f'djet: error: {output}: File too large'
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize('text', [
     'groceries', 'bread\nmilk', '{"shop": "corner"}\n{"item": "bread"}', '{"shop": "corner"}\n'])
 def test_foreign_records_are_refused_and_left_unchanged(text: str, tmp_path: Path) -> None:

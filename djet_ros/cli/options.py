@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from djet_ros.errors import DjetError
-from djet_ros.recordings.outputs import check_file, make_folder, write_whole
+from djet_ros.recordings.outputs import check_file, check_writable, write_whole
 
 
 # Formats of recordings, for help texts.
@@ -49,7 +49,7 @@ def add_json_output(parser: argparse.ArgumentParser) -> None:
 def check_output(args: argparse.Namespace, *suffixes: str) -> None:
     """Make the folder of --output; raise DjetError if the file can't be written there."""
     check_file(args.output, args.overwrite, *suffixes)
-    make_folder(args.output.parent)
+    check_writable(args.output)
 
 
 def check_json_output(args: argparse.Namespace) -> None:

@@ -68,6 +68,16 @@ def make_folder(folder: Path) -> None:
                         'another --output') from error
 
 
+def check_writable(path: Path) -> None:
+    """Make the folder of a file; raise DjetError if it, or a file in it, can't be created."""
+    make_folder(path.parent)
+    try:
+        TemporaryDirectory(prefix='.djet-', dir=path.parent).cleanup()
+    except OSError as error:
+        raise DjetError(f'{path} could not be created: {error.strerror or error}; choose another '
+                        '--output') from error
+
+
 def _check_obstacles(folder: Path) -> None:
     for place in (*reversed(folder.parents), folder):
         if place.is_symlink() and not place.exists():
