@@ -60,11 +60,20 @@ def check_json_output(args: argparse.Namespace) -> None:
 
 def write_json(path: Path, figures: Any, draw: Callable[[Path], None] | None = None) -> None:
     """Write the results as JSON, and perhaps a plot next to it, and print the paths."""
-    write_whole(path, json.dumps(figures, indent=2) + '\n')
+    write_whole(path, json.dumps(_finite(figures), indent=2, allow_nan=False) + '\n')
     plot = path.with_suffix('.png')
     if draw is not None:
         draw(plot)
     print(f'figures: {path}' + f'\nplot: {plot}' * (draw is not None))
+
+
+def _finite(value: Any) -> Any:
+    """Return a value with None for NaN and infinities, which JSON does not have."""
+    if isinstance(value, dict):
+        return {name: _finite(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def add_frames(parser: argparse.ArgumentParser) -> None:
