@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 import os
 from pathlib import Path
+import shutil
 import subprocess
 import sys
 
@@ -170,6 +171,20 @@ def test_an_invalid_call_is_one_line_and_exit_code_2(
     assert captured.err.startswith('djet: error: ')
     assert captured.err.count('\n') == 1
     assert message in captured.err
+
+
+def test_no_figure_replaces_its_image(road, tmp_path, capsys):
+    images = shutil.copytree(road / 'image_0', tmp_path / 'images')
+    before = {path.name: path.read_bytes() for path in images.iterdir()}
+    first, second = str(images / '000000.png'), str(images / '000001.png')
+    for call in (['similarity', first, '--output', first],
+                 ['similarity', first, second, '--output', second],
+                 ['surfaces', first, second, '--camera', '9,9,9,9', '--output', first]):
+        assert lab([*call, '--overwrite']) == 2
+        assert capsys.readouterr().err == (
+            f"djet: error: --output is '{call[-1]}', which belongs to the input; choose another "
+            'one\n')
+    assert {path.name: path.read_bytes() for path in images.iterdir()} == before
 
 
 def without_screen():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 import json
 import math
 from pathlib import Path
@@ -46,9 +46,9 @@ def add_json_output(parser: argparse.ArgumentParser) -> None:
                metavar='FILE.json')
 
 
-def check_output(args: argparse.Namespace, *suffixes: str) -> None:
+def check_output(args: argparse.Namespace, *suffixes: str, inputs: Iterable[Path] = ()) -> None:
     """Make the folder of --output; raise DjetError if the file can't be written there."""
-    check_file(args.output, args.overwrite, *suffixes)
+    check_file(args.output, args.overwrite, *suffixes, inputs=inputs)
     check_writable(args.output)
 
 

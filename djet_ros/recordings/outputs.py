@@ -6,7 +6,7 @@ Nothing is replaced without ``overwrite``, and nothing that this package did not
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 import os
 from pathlib import Path
@@ -16,8 +16,16 @@ from tempfile import TemporaryDirectory
 from djet_ros.errors import DjetError
 
 
-def check_file(path: Path, overwrite: bool, *suffixes: str) -> None:
-    """Raise DjetError if a file can't be written there, or its name has none of the suffixes."""
+def check_file(path: Path, overwrite: bool, *suffixes: str, inputs: Iterable[Path] = ()) -> None:
+    """
+    Raise DjetError if a file can't be written there, or its name has none of the suffixes.
+
+    inputs: files and folders that are read; the file may be none of them, and in none of them.
+    """
+    for given in inputs:
+        if path.resolve().is_relative_to(given.resolve()):
+            raise DjetError(f"--output is '{path}', which belongs to the input; choose another "
+                            'one')
     if path.is_dir():
         raise DjetError(f'{path} is a folder; name a file')
     if suffixes and path.suffix.lower() not in suffixes:

@@ -50,6 +50,8 @@ LANDMARKS = 'landmarks.ply'
 DEBUG = 'debug'
 _FILES = (SUMMARY, PLOT, LANDMARKS, 'trajectory_tum.txt', 'trajectory_kitti.txt', 'frames.csv',
           'errors.csv', 'config.yaml')
+# Of all that a replay writes into the folder.
+NAMES = (*_FILES, BAG, DEBUG)
 
 # The summary until the run has ended.
 UNFINISHED = {'complete': False, 'error': 'the run did not complete'}
@@ -73,7 +75,7 @@ class ResultsFolder(Closing):
         self.path = path
         present = path.exists()
         with self._beginning():
-            make_room(path, (*_FILES, BAG, DEBUG), overwrite, marks=(SUMMARY, 'config.yaml'))
+            make_room(path, NAMES, overwrite, marks=(SUMMARY, 'config.yaml'))
         try:
             with self._beginning():
                 self._begin(config)
