@@ -15,7 +15,7 @@ from djet_ros.config.sections import Config
 from djet_ros.errors import DjetError
 from djet_ros.lab.store import FILE_NAME, RecordStore
 from djet_ros.lab.style import figure
-from djet_ros.recordings.outputs import write_whole
+from djet_ros.recordings.outputs import check_ours, write_whole
 from djet_ros.replay.results import plot_trajectory, ResultsFolder
 import numpy as np
 import pytest
@@ -109,6 +109,29 @@ def test_figures_are_json_and_their_plot_replaces_no_other_image(
         assert why in stderr
         assert stderr.count('\n') == 1
     assert held(tmp_path) == {'f.png': 'my photo'}
+
+
+@pytest.mark.parametrize('verb', [
+    ('lens', 'images'), ('lab', 'evaluate', 'images'), ('lab', 'ablate', 'images'),
+    ('lab', 'coverage', '--scenes', 'road'), ('lab', 'beside'), ('lab', 'lengths')])
+def test_results_are_not_put_among_the_files_of_others(
+        verb: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / '000000.png').write_text('of a recording', 'utf-8')
+    assert main([*verb, '--overwrite', '--output', str(tmp_path)]) == 2
+    assert capsys.readouterr().err == (
+        f'djet: error: {tmp_path} is not empty and holds no earlier results; choose another '
+        '--output\n')
+    assert held(tmp_path) == {'000000.png': 'of a recording'}
+
+
+def test_what_an_interrupted_run_has_left_is_not_of_others(tmp_path: Path) -> None:
+    check_ours(tmp_path / 'new', ('plots',), FILE_NAME)
+    for name in ('plots', '.frames-7', FILE_NAME, 'notes.txt'):
+        (tmp_path / name).touch()
+        check_ours(tmp_path, ('plots',), FILE_NAME)
+    (tmp_path / FILE_NAME).unlink()
+    with pytest.raises(DjetError, match='is not empty and holds no earlier results'):
+        check_ours(tmp_path, ('plots',), FILE_NAME)
 
 
 @pytest.mark.parametrize('verb', [

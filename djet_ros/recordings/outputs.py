@@ -57,13 +57,31 @@ def check_room(folder: Path, ours: Collection[str], overwrite: bool,
     _check_obstacles(folder)
     if marks and folder.is_dir() and any(folder.iterdir()) \
             and not all((folder / mark).is_file() for mark in marks):
-        raise DjetError(f'{folder} is not empty and holds no earlier results; choose another '
-                        '--output')
+        raise _foreign(folder)
     present = [folder / name for name in ours if os.path.lexists(folder / name)]
     if present and not overwrite:
         raise DjetError(f'{folder} holds earlier results; choose another --output, or replace '
                         'them with --overwrite')
     return present
+
+
+def check_ours(folder: Path, ours: Collection[str], mark: str) -> None:
+    """
+    Raise DjetError if a folder holds files of others, such as images, but none of an earlier run.
+
+    ours: names that a run writes, of which an interrupted one leaves some; mark: the one of a
+    folder in which foreign files are accepted. Hidden files are.
+    """
+    _check_obstacles(folder)
+    if folder.is_dir() and not (folder / mark).is_file() and any(
+            path.name not in ours and not path.name.startswith('.')
+            for path in folder.iterdir()):
+        raise _foreign(folder)
+
+
+def _foreign(folder: Path) -> DjetError:
+    return DjetError(f'{folder} is not empty and holds no earlier results; choose another '
+                     '--output')
 
 
 def make_folder(folder: Path) -> None:
