@@ -96,6 +96,10 @@ def test_results_that_cannot_be_started_leave_the_folder_unchanged(
         ResultsFolder(place, Config())
     assert list(tmp_path.rglob('*')) == ([place] if present else [])
     ResultsFolder(place, Config()).close()
+    begun = {path: path.stat().st_mtime_ns for path in place.rglob('*') if path.is_file()}
+    with full_disk(), pytest.raises(DjetError, match='File too large'):
+        ResultsFolder(place, Config(), overwrite=True)
+    assert {path: path.stat().st_mtime_ns for path in place.rglob('*') if path.is_file()} == begun
 
 
 @pytest.mark.parametrize('verb', [('bench', 'sequence'), ('closure', 'sequence'), ('soak',)])

@@ -539,6 +539,21 @@ def test_a_mistake_in_the_command_costs_no_earlier_results(mistake, bag, replaye
     assert {path: path.read_bytes() for path in results.rglob('*') if path.is_file()} == before
 
 
+def test_images_of_which_none_can_be_used_cost_no_earlier_results(folder, replayed, tmp_path):
+    results = tmp_path / 'results'
+    shutil.copytree(replayed[0], results)
+    before = {path: path.read_bytes() for path in results.rglob('*') if path.is_file()}
+    shutil.copytree(folder, tmp_path / '00')
+    for path in (tmp_path / '00' / 'image_0').iterdir():
+        path.write_bytes(path.read_bytes()[:500])
+    printed = djet('replay', tmp_path / '00', '--output', results, '--overwrite', expect=2).stderr
+    assert f'none of {FRAMES} images could be used' in printed
+    assert {path: path.read_bytes() for path in results.rglob('*') if path.is_file()} == before
+    djet('replay', folder, '--output', results, '--overwrite', '--preset', 'paper')
+    assert summary(results)['preset'] == 'paper'
+    assert not list(results.glob('.*'))
+
+
 @pytest.mark.slow
 def test_results_are_utf_8_whatever_the_locale_is(bag, tmp_path):
     done = djet_alone('replay', bag, '--output', tmp_path / 'out', LC_ALL='C', PYTHONUTF8='0',

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import os
 from pathlib import Path
 import shutil
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp, TemporaryDirectory
 
 from djet_ros.errors import DjetError
 
@@ -49,6 +49,51 @@ def make_room(folder: Path, ours: Collection[str], overwrite: bool,
         else:
             path.unlink()
     make_folder(folder)
+
+
+class SetAside:
+    """
+    What an earlier run wrote into a folder, in a hidden folder there until it is given up.
+
+    Makes room as ``make_room`` does, with its arguments and errors. A run that is killed leaves
+    it hidden.
+    """
+
+    def __init__(self, folder: Path, ours: Collection[str], overwrite: bool,
+                 marks: Collection[str] = ()) -> None:
+        """Move the files of an earlier run; all stay where they were if that fails."""
+        self._folder = folder
+        self._place: Path | None = None
+        present = check_room(folder, ours, overwrite, marks)
+        make_folder(folder)
+        if not present:
+            return
+        self._place = Path(mkdtemp(prefix='.earlier-', dir=folder))
+        try:
+            for path in present:
+                path.rename(self._place / path.name)
+        except BaseException:
+            self.put_back()
+            raise
+
+    @property
+    def kept(self) -> bool:
+        """Whether anything was set aside, and not given up."""
+        return self._place is not None
+
+    def give_up(self) -> None:
+        """Remove what was set aside, if it is still there. Raises OSError."""
+        if self._place is not None:
+            shutil.rmtree(self._place)
+            self._place = None
+
+    def put_back(self) -> None:
+        """Move it back to where it was, unless it was given up. Raises OSError."""
+        if self._place is not None:
+            for path in self._place.iterdir():
+                path.rename(self._folder / path.name)
+            self._place.rmdir()
+            self._place = None
 
 
 def check_room(folder: Path, ours: Collection[str], overwrite: bool,
