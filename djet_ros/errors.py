@@ -1,5 +1,9 @@
 """The one exception for what a user can mend."""
 
+from __future__ import annotations
+
+from typing import Any
+
 # Room for a path, a list of choices and advice; what a hostile file says has no more.
 LONGEST_LINE = 1000
 
@@ -24,3 +28,17 @@ class DjetError(Exception):
     def __init__(self, text: object) -> None:
         """Make the text a line."""
         super().__init__(one_line(text))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """
+        Pickle the line and the attributes, as a worker sends them.
+
+        Exceptions are rebuilt by their constructor, but that of a subclass takes other arguments.
+        """
+        return _rebuilt, (type(self), self.args, vars(self))
+
+
+def _rebuilt(kind: type[DjetError], args: tuple[str], attributes: dict[str, Any]) -> DjetError:
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(attributes)
+    return error

@@ -434,7 +434,8 @@ def covered(folder: Path, name: str = '') -> list[list[str]]:
         by_scene.setdefault(name or row['scene'], []).append(row)
 
     def cells(row: dict[str, Any]) -> list[str]:
-        within, beyond = row['inside'][at[0]][0], 1 - row['inside'][at[1]][0]
+        within, whole = (row['inside'][index][0] for index in at)
+        beyond = None if whole is None else 1 - whole
         return [str(row['pairs']), str(row['told']), str(row['wrong_and_sure']),
                 str(row.get('untold', '–')), f"{row['given_up']} ({row['needlessly']})",
                 formatted(row['median'], '.2f'), formatted(within, '.1%'),

@@ -4,6 +4,7 @@ import argparse
 from array import array
 from dataclasses import replace
 from pathlib import Path
+import pickle
 
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import flat, from_flat, with_values
@@ -12,6 +13,8 @@ from djet_ros.config.yaml_files import dump_yaml, load_yaml, why_unused
 from djet_ros.core.estimator_config import preset
 from djet_ros.errors import DjetError
 from djet_ros.live.parameters import FIXED_PARAMETERS, live_choices, tf_reason, with_live_values
+from djet_ros.odometry.images import BadMessage
+from djet_ros.recordings.frame_sequence import DamagedImage
 from hypothesis import given, settings, strategies as st
 import pytest
 
@@ -290,6 +293,15 @@ def test_error_messages_contain_no_control_characters():
     error = DjetError('no parameter \x1b[2J\n\u202e ' + 'x' * 5000)
     assert str(error).startswith('no parameter ?[2J ? xxx')
     assert len(str(error)) < 1100
+
+
+@pytest.mark.parametrize('error', [
+    DjetError('no parameter'), BadMessage('undecodable', 'JPEG image of 3 bytes is cut short'),
+    DamagedImage(Path('a.png'), BadMessage('undecodable', 'PNG image of 500 bytes is cut short'))])
+def test_an_error_of_a_worker_arrives_whole(error):
+    received = pickle.loads(pickle.dumps(error))
+    assert (type(received), str(received)) == (type(error), str(error))
+    assert vars(received) == vars(error)
 
 
 def test_offline_choices_are_not_available_live():

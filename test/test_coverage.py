@@ -11,6 +11,7 @@ from types import ModuleType
 import warnings
 
 import commands
+from djet_ros.cli.options import write_json
 from djet_ros.core.covariance import pose_difference, widened_to_span
 from djet_ros.core.geometry import rotation_exp, sphere_tangents, unit
 from djet_ros.core.types import Pose, RelativePose, Status
@@ -155,7 +156,7 @@ def test_a_recorded_table_shows_unreported_errors_or_a_dash_if_they_were_not_cou
         record(), record(scene='rotation', square=nan, status=Status.NO_PARALLAX),
         record(scene='whip', square=nan, status=Status.NO_PARALLAX, failed=True)])]
     del rows[0]['untold']
-    (tmp_path / 'coverage.json').write_text(json.dumps({'levels': LEVELS, 'rows': rows}))
+    write_json(tmp_path / 'coverage.json', {'levels': LEVELS, 'rows': rows})
     road, whip = recorder().covered(tmp_path)
     assert road[:5] == ['road', '1', '1', '0', '–']
     assert whip == ['whip', '1', '0', '0', '1', '0 (0)', '–', '–', '–']

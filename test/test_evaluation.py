@@ -549,6 +549,17 @@ def test_files_of_others_are_not_replaced(road, tmp_path):
     assert (tmp_path / 'index.html').read_text() != 'a page of mine'
 
 
+def test_a_damaged_image_is_named(small_kitti, tmp_path):
+    sequence = small_kitti()
+    cut = sequence / 'image_0' / '000001.png'
+    cut.write_bytes(cut.read_bytes()[:500])
+    answer = djet('evaluate', sequence, '--workers', '1', '--output', tmp_path / 'table', *RUN)
+    assert answer.returncode == 2
+    assert answer.stderr.splitlines()[-1] == (
+        f'djet: error: {cut} is a damaged image (PNG image of 500 bytes is cut short); replace '
+        'it, or exclude its frame')
+
+
 def test_a_damaged_store_is_named(road, tmp_path):
     run = ('evaluate', road, '--end', '3', '--presets', 'best', '--methods', 'five_point',
            '--workers', '1', '--output', tmp_path)

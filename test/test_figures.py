@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import os
 from pathlib import Path
+import shutil
 import subprocess
 import sys
 
@@ -65,6 +67,15 @@ def test_points_are_found_again_in_a_shifted_image(gray):
     for index in np.flatnonzero(right):
         x, y = missing[index]
         assert found.surfaces[12 + y, 12 + x, index] == 0
+
+
+def test_matches_of_additional_features_are_taken_too(gray):
+    # In an image with more corners than are sought, some features are detected on demand.
+    few = replace(CONFIG, max_features=300)
+    features = TwoViewEstimator(few).view(gray, np.eye(3)).features
+    assert len(features) < len(features.with_additional)
+    found = cross_similarity(gray, np.roll(gray, (2, 5), axis=(0, 1)), None, 40, 12, few)
+    assert len(found.x) == 40
 
 
 def test_the_strongest_keypoints_are_taken_and_kept_apart(gray):
@@ -160,6 +171,20 @@ def test_an_invalid_call_is_one_line_and_exit_code_2(
     assert captured.err.startswith('djet: error: ')
     assert captured.err.count('\n') == 1
     assert message in captured.err
+
+
+def test_no_figure_replaces_its_image(road, tmp_path, capsys):
+    images = shutil.copytree(road / 'image_0', tmp_path / 'images')
+    before = {path.name: path.read_bytes() for path in images.iterdir()}
+    first, second = str(images / '000000.png'), str(images / '000001.png')
+    for call in (['similarity', first, '--output', first],
+                 ['similarity', first, second, '--output', second],
+                 ['surfaces', first, second, '--camera', '9,9,9,9', '--output', first]):
+        assert lab([*call, '--overwrite']) == 2
+        assert capsys.readouterr().err == (
+            f"djet: error: --output is '{call[-1]}', which belongs to the input; choose another "
+            'one\n')
+    assert {path.name: path.read_bytes() for path in images.iterdir()} == before
 
 
 def without_screen():

@@ -270,7 +270,10 @@ def huge_jpeg():
 
 
 @pytest.mark.parametrize('data, expected', [
-    (b'', 'unknown_encoding'),
+    (b'', 'undecodable'),
+    (b'\xff', 'undecodable'),
+    (encoded('.png')[:5], 'undecodable'),
+    (encoded('.png')[:20], 'undecodable'),
     (b'GIF89a' + bytes(40), 'unknown_encoding'),
     (encoded('.bmp'), 'unknown_encoding'),
     (encoded('.png')[:-300], 'undecodable'),

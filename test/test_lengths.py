@@ -129,6 +129,8 @@ def test_the_command_reports_the_lengths_of_a_path(
     assert 'road 0' in capsys.readouterr().out
     estimated, = json.loads((tmp_path / 'lengths.json').read_text())
     assert estimated['scale_change'] == values[0].scale_change
+    # The path is too short for it; JSON has no NaN.
+    assert estimated['pose_square_25'] is None
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 import os
 from pathlib import Path
@@ -12,8 +14,10 @@ from djet_ros.cli.main import main
 from djet_ros.config.sections import Config
 from djet_ros.errors import DjetError
 from djet_ros.lab.store import FILE_NAME, RecordStore
-from djet_ros.recordings.outputs import write_whole
-from djet_ros.replay.results import ResultsFolder
+from djet_ros.lab.style import figure
+from djet_ros.recordings.outputs import check_ours, write_whole
+from djet_ros.replay.results import plot_trajectory, ResultsFolder
+import numpy as np
 import pytest
 
 
@@ -22,6 +26,17 @@ class Count:
     """The plainest record."""
 
     number: int
+
+
+@contextmanager
+def full_disk() -> Iterator[None]:
+    """Let this process write no file beyond ten bytes, as on a full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def held(folder: Path) -> dict[str, str]:
@@ -57,22 +72,34 @@ def test_a_file_that_can_not_be_written_leaves_nothing_behind(tmp_path: Path) ->
     assert [path.name for path in tmp_path.iterdir()] == ['folder']
 
 
+def test_a_figure_that_can_not_be_written_leaves_the_earlier_one_and_is_named(
+        tmp_path: Path) -> None:
+    path = tmp_path / 'plot.png'
+    path.write_bytes(b'earlier')
+    with full_disk(), pytest.raises(OSError, match='File too large') as caught, \
+            figure(path, 3, 3):
+        pass
+    assert caught.value.filename == str(path)
+    with full_disk(), pytest.raises(DjetError, match='plot.png could not be written: File too'):
+        plot_trajectory(path, np.zeros((2, 3)), None, np.empty((0, 2), np.float32), 'none', 'm')
+    assert held(tmp_path) == {'plot.png': 'earlier'}
+
+
 @pytest.mark.parametrize('present', [False, True])
 def test_results_that_cannot_be_started_leave_the_folder_unchanged(
         present: bool, tmp_path: Path) -> None:
     place = tmp_path / 'results'
     if present:
         place.mkdir()
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    # As on a full disk.
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
-    try:
-        with pytest.raises(DjetError, match='results could not be created: File too large'):
-            ResultsFolder(place, Config())
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with full_disk(), pytest.raises(DjetError,
+                                    match='results could not be created: File too large'):
+        ResultsFolder(place, Config())
     assert list(tmp_path.rglob('*')) == ([place] if present else [])
     ResultsFolder(place, Config()).close()
+    begun = {path: path.stat().st_mtime_ns for path in place.rglob('*') if path.is_file()}
+    with full_disk(), pytest.raises(DjetError, match='File too large'):
+        ResultsFolder(place, Config(), overwrite=True)
+    assert {path: path.stat().st_mtime_ns for path in place.rglob('*') if path.is_file()} == begun
 
 
 @pytest.mark.parametrize('verb', [('bench', 'sequence'), ('closure', 'sequence'), ('soak',)])
@@ -86,6 +113,47 @@ def test_figures_are_json_and_their_plot_replaces_no_other_image(
         assert why in stderr
         assert stderr.count('\n') == 1
     assert held(tmp_path) == {'f.png': 'my photo'}
+
+
+@pytest.mark.parametrize('verb', [
+    ('lens', 'images'), ('lab', 'evaluate', 'images'), ('lab', 'ablate', 'images'),
+    ('lab', 'coverage', '--scenes', 'road'), ('lab', 'beside'), ('lab', 'lengths')])
+def test_results_are_not_put_among_the_files_of_others(
+        verb: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / '000000.png').write_text('of a recording', 'utf-8')
+    assert main([*verb, '--overwrite', '--output', str(tmp_path)]) == 2
+    assert capsys.readouterr().err == (
+        f'djet: error: {tmp_path} is not empty and holds no earlier results; choose another '
+        '--output\n')
+    assert held(tmp_path) == {'000000.png': 'of a recording'}
+
+
+def test_what_an_interrupted_run_has_left_is_not_of_others(tmp_path: Path) -> None:
+    check_ours(tmp_path / 'new', ('plots',), FILE_NAME)
+    for name in ('plots', '.frames-7', FILE_NAME, 'notes.txt'):
+        (tmp_path / name).touch()
+        check_ours(tmp_path, ('plots',), FILE_NAME)
+    (tmp_path / FILE_NAME).unlink()
+    with pytest.raises(DjetError, match='is not empty and holds no earlier results'):
+        check_ours(tmp_path, ('plots',), FILE_NAME)
+
+
+@pytest.mark.parametrize('verb', [
+    ('bench', 'sequence'), ('closure', 'sequence'), ('soak', '--frames', '100')])
+def test_figures_without_a_place_are_refused_before_they_are_measured(
+        verb: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    # No mode holds root back, but nobody creates files there.
+    assert main(['lab', *verb, '--output', '/proc/f.json']) == 2
+    assert capsys.readouterr().err.startswith('djet: error: /proc/f.json could not be created: ')
+
+
+def test_figures_that_find_a_full_disk_are_named(
+        tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / 'f.json'
+    with full_disk():
+        assert main(['lab', 'soak', '--frames', '100', '--output', str(output)]) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == f'djet: error: {output}: File too large'
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize('text', [

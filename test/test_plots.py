@@ -63,7 +63,12 @@ def test_logarithmic_axes_are_labelled_by_numbers(tmp_path: Path, values: list[f
 def test_a_trajectory_is_shown_with_landmarks_up_to_its_own_extent_away(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch, far: float, right: float) -> None:
     drawn: list[Figure] = []
-    monkeypatch.setattr(Figure, 'savefig', lambda one, *_, **__: drawn.append(one))
+
+    def keep(one: Figure, file: Path, **_: object) -> None:
+        file.touch()
+        drawn.append(one)
+
+    monkeypatch.setattr(Figure, 'savefig', keep)
     path = np.linspace([0.0, 0.0, 0.0], [0.0, 0.0, 20.0], 9)
     landmarks = np.tile(np.float32([far, 10.0]), (100, 1))
     # Some of the landmarks are wrong.

@@ -344,6 +344,18 @@ def test_exported_covariances_are_inflated_for_correlated_errors(results, tmp_pa
     assert unknown.inflated() is unknown
 
 
+def test_export_replaces_nothing_of_the_replay(results, tmp_path):
+    shutil.copytree(results, tmp_path / 'results')
+    before = {path: path.read_bytes() for path in (tmp_path / 'results').glob('*.*')}
+    for name in ('frames.csv', 'errors.csv', 'bag/graph.csv'):
+        refused = djet('export', tmp_path / 'results', '--format', 'csv', '--output',
+                       tmp_path / 'results' / name, '--overwrite', expect=2).stderr
+        assert f"{name}', which belongs to the input; choose another one" in refused
+    assert {path: path.read_bytes() for path in (tmp_path / 'results').glob('*.*')} == before
+    # Beside them it may lie.
+    djet('export', tmp_path / 'results', '--output', tmp_path / 'results' / 'drive.g2o')
+
+
 def test_export_refuses_to_overwrite_and_warns_of_unknown_scale(
         unscaled, tmp_path):
     out = tmp_path / 'graph.g2o'

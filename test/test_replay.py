@@ -539,6 +539,21 @@ def test_a_mistake_in_the_command_costs_no_earlier_results(mistake, bag, replaye
     assert {path: path.read_bytes() for path in results.rglob('*') if path.is_file()} == before
 
 
+def test_images_of_which_none_can_be_used_cost_no_earlier_results(folder, replayed, tmp_path):
+    results = tmp_path / 'results'
+    shutil.copytree(replayed[0], results)
+    before = {path: path.read_bytes() for path in results.rglob('*') if path.is_file()}
+    shutil.copytree(folder, tmp_path / '00')
+    for path in (tmp_path / '00' / 'image_0').iterdir():
+        path.write_bytes(path.read_bytes()[:500])
+    printed = djet('replay', tmp_path / '00', '--output', results, '--overwrite', expect=2).stderr
+    assert f'none of {FRAMES} images could be used' in printed
+    assert {path: path.read_bytes() for path in results.rglob('*') if path.is_file()} == before
+    djet('replay', folder, '--output', results, '--overwrite', '--preset', 'paper')
+    assert summary(results)['preset'] == 'paper'
+    assert not list(results.glob('.*'))
+
+
 @pytest.mark.slow
 def test_results_are_utf_8_whatever_the_locale_is(bag, tmp_path):
     done = djet_alone('replay', bag, '--output', tmp_path / 'out', LC_ALL='C', PYTHONUTF8='0',
@@ -679,6 +694,7 @@ def test_recording_without_tracked_pairs_gives_a_warning(tmp_path):
     found = summary(tmp_path / 'out')
     assert (found['positions'], found['drift']) == (None, None)
     assert found['failures'] == FRAMES - 1
+    assert found['scale_kind'] == 'unknown'
 
 
 def test_a_recording_of_one_image_gives_a_warning(tmp_path):
@@ -777,15 +793,20 @@ def test_bad_first_image_is_named_and_does_not_change_the_other_poses(bad, tmp_p
         tmp_path / 'without' / 'trajectory_tum.txt').read_bytes()
 
 
-@pytest.mark.parametrize('at', [0, 3])
-def test_damaged_image_file_is_counted_like_a_bad_image_of_a_bag(at, folder, tmp_path):
+@pytest.mark.parametrize(('at', 'left', 'why'), [
+    (0, 500, 'PNG image of 500 bytes is cut short'),
+    (3, 500, 'PNG image of 500 bytes is cut short'),
+    (3, 20, 'PNG image of 20 bytes is cut short'), (0, 0, 'compressed image is empty'),
+    (FRAMES - 1, 0, 'compressed image is empty')])
+def test_damaged_image_file_is_counted_like_a_bad_image_of_a_bag(
+        at, left, why, folder, tmp_path):
     shutil.copytree(folder, tmp_path / '00')
     cut = tmp_path / '00' / 'image_0' / f'{at:06d}.png'
-    cut.write_bytes(cut.read_bytes()[:500])
+    cut.write_bytes(cut.read_bytes()[:left])
     printed = djet('replay', tmp_path / '00', '--output', tmp_path / 'r', expect=2).stderr
     assert printed == (
         f'djet: error: {tmp_path / "00"}: 1 of {FRAMES} images could not be used; image {at}: '
-        'PNG image of 500 bytes is cut short\n')
+        f'{why}\n')
     found = summary(tmp_path / 'r')
     assert (found['complete'], found['frames']) == (True, FRAMES - 1)
     assert found['rejected'] == {'undecodable': 1}

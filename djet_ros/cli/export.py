@@ -10,7 +10,9 @@ from pathlib import Path
 from djet_ros.cli.options import add_output
 from djet_ros.cli.terminal import warn
 from djet_ros.posegraph.graph_files import FORMATS, write_graph
+from djet_ros.recordings.outputs import check_file
 from djet_ros.replay.graph_of_results import read_results
+from djet_ros.replay.results import NAMES
 
 DESCRIPTION = """\
 Write the pose graph of a replay: a vertex for each tracked frame, and an edge for each pair with
@@ -36,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the file, and print the number of poses and edges."""
+    check_file(args.output, args.overwrite, inputs=(args.results / name for name in NAMES))
     graph = read_results(args.results, warn)
     if args.chained:
         graph = replace(graph, edges=tuple(edge.inflated() for edge in graph.edges))

@@ -12,7 +12,7 @@ from djet_ros.config.flags import add_flags
 from djet_ros.errors import one_line
 from djet_ros.lab.lens import calibration, examine, LensReport, plot_lens
 from djet_ros.recordings.bags import is_bag
-from djet_ros.recordings.outputs import check_room, make_room, write_whole
+from djet_ros.recordings.outputs import check_ours, check_room, make_room, write_whole
 from djet_ros.recordings.recording import open_recording
 
 DESCRIPTION = """\
@@ -47,6 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the recording through the odometry, and print the estimated distortion."""
     if args.output is not None:
+        # An image among those of a recording, lens.png would be one of them.
+        check_ours(args.output, (YAML, PLOT), PLOT)
         check_room(args.output, (YAML, PLOT), args.overwrite)
     config = configuration(args)
     with open_recording(args.source, args.image_topic, args.info_topic) as recording, \

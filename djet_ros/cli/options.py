@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 import json
 import math
 from pathlib import Path
 from typing import Any
 
 from djet_ros.errors import DjetError
-from djet_ros.recordings.outputs import check_file, make_folder, write_whole
+from djet_ros.recordings.outputs import check_file, check_writable, write_whole
 
 
 # Formats of recordings, for help texts.
@@ -46,10 +46,10 @@ def add_json_output(parser: argparse.ArgumentParser) -> None:
                metavar='FILE.json')
 
 
-def check_output(args: argparse.Namespace, *suffixes: str) -> None:
+def check_output(args: argparse.Namespace, *suffixes: str, inputs: Iterable[Path] = ()) -> None:
     """Make the folder of --output; raise DjetError if the file can't be written there."""
-    check_file(args.output, args.overwrite, *suffixes)
-    make_folder(args.output.parent)
+    check_file(args.output, args.overwrite, *suffixes, inputs=inputs)
+    check_writable(args.output)
 
 
 def check_json_output(args: argparse.Namespace) -> None:
@@ -60,11 +60,20 @@ def check_json_output(args: argparse.Namespace) -> None:
 
 def write_json(path: Path, figures: Any, draw: Callable[[Path], None] | None = None) -> None:
     """Write the results as JSON, and perhaps a plot next to it, and print the paths."""
-    write_whole(path, json.dumps(figures, indent=2) + '\n')
+    write_whole(path, json.dumps(_finite(figures), indent=2, allow_nan=False) + '\n')
     plot = path.with_suffix('.png')
     if draw is not None:
         draw(plot)
     print(f'figures: {path}' + f'\nplot: {plot}' * (draw is not None))
+
+
+def _finite(value: Any) -> Any:
+    """Return a value with None for NaN and infinities, which JSON does not have."""
+    if isinstance(value, dict):
+        return {name: _finite(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def add_frames(parser: argparse.ArgumentParser) -> None:

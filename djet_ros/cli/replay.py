@@ -104,8 +104,8 @@ def opened_replay(args: argparse.Namespace, config: Config, recording: Path, fol
     """
     Open a recording with the topics and poses of the options; yield a function that replays it.
 
-    The results folder is cleared only after the recording was opened: on an error the results of
-    an earlier run are kept. draw: whether to write drawings of the pairs.
+    The results folder is cleared only after the first image could be used: on an error before
+    that the results of an earlier run are kept. draw: whether to write drawings of the pairs.
     """
     wanted = _auxiliary_inputs(config.odometry)
     check_topics(args, wanted)

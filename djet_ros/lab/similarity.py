@@ -123,8 +123,8 @@ def _matches(gray: Gray, other: Gray, config: EstimatorConfig) -> tuple[Array, A
     x, y = estimator.match(views[0], views[1])
     if not len(x):
         raise DjetError('the two images have no matches; choose images of the same scene')
-    strength = {tuple(point): response for point, response
-                in zip(views[0].features.points.tolist(), views[0].features.responses.tolist())}
+    features = views[0].features.with_additional
+    strength = dict(zip(map(tuple, features.points.tolist()), features.responses.tolist()))
     order = np.argsort([-strength[tuple(point)] for point in x.tolist()], kind='stable')
     return x[order], y[order]
 

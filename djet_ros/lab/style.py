@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+from djet_ros.recordings.outputs import replaced_whole
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, LogFormatterMathtext
@@ -47,14 +48,14 @@ STYLE: dict[Any, Any] = {
 
 @contextmanager
 def figure(path: Path, width: float, height: float) -> Iterator[Figure]:
-    """Yield an empty figure of a size in inches, and save it as PNG at the end."""
+    """Yield an empty figure of a size in inches, and save it as PNG at the end, atomically."""
     # A Figure without pyplot needs no display and has no global state.
     with rc_context(STYLE):
         empty = Figure(figsize=(width, height), layout='constrained')
         yield empty
         _label_logarithms(empty)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        empty.savefig(path, dpi=120)
+        with replaced_whole(path) as new:
+            empty.savefig(new, dpi=120)
 
 
 class _Decimal(LogFormatter):

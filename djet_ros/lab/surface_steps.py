@@ -17,6 +17,7 @@ from djet_ros.core.types import Array, RelativePose, Status, View
 from djet_ros.errors import DjetError
 from djet_ros.lab import panels
 from djet_ros.lab.style import figure, STYLE
+from djet_ros.recordings.outputs import replaced_whole
 from matplotlib import rc_context
 from matplotlib.animation import PillowWriter
 from matplotlib.axes import Axes
@@ -115,8 +116,7 @@ def animate_trace(path: Path, trace: Trace, match: int) -> None:
         _draw_round(grid[1], trace, match, 0)
         _describe(drawing, grid)
         writer = PillowWriter(fps=1)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with writer.saving(drawing, str(path), dpi=100):
+        with replaced_whole(path) as new, writer.saving(drawing, str(new), dpi=100):
             for index in range(len(trace.rounds)):
                 grid[1].clear()
                 _draw_round(grid[1], trace, match, index)

@@ -35,6 +35,8 @@ _SMALLEST_SIDE = 16
 _PUBLISHER = ('correct height, width, step and encoding in the node that publishes it, or choose '
               'another image topic')
 
+JPEG_START = b'\xff\xd8'
+
 # Scans of a progressive JPEG: encoders write about ten.
 _MOST_SCANS = 64
 
@@ -246,12 +248,15 @@ def _check_size(width: int, height: int) -> None:
 
 def _declared_size(raw: bytes) -> tuple[int, int]:
     """Return (width, height) that a PNG or JPEG declares, without decoding it."""
-    if raw[:8] == PNG_START and raw[12:16] == b'IHDR' and len(raw) >= 24:
+    if not raw:
+        raise BadMessage('undecodable', 'compressed image is empty')
+    if PNG_START.startswith(raw[:8]):
         if not is_complete_png(raw):
             raise BadMessage('undecodable', f'PNG image of {len(raw)} bytes is cut short')
-        width, height = struct.unpack('>II', raw[16:24])
-        return width, height
-    if raw[:2] == b'\xff\xd8':
+        if raw[12:16] == b'IHDR' and len(raw) >= 24:
+            width, height = struct.unpack('>II', raw[16:24])
+            return width, height
+    if JPEG_START.startswith(raw[:2]):
         # Decoders fill a truncated image with gray. Cameras pad the end with zeros.
         if b'\xff\xd9' not in raw[-4096:]:
             raise BadMessage('undecodable', f'JPEG image of {len(raw)} bytes is cut short')

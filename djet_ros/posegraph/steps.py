@@ -55,9 +55,9 @@ class Step(Motion):
 
 
 def scale_of(steps: Iterable[Step]) -> Scale:
-    """Return the kind of scale of a trajectory: unknown if one of its lengths is."""
+    """Return the kind of scale of a trajectory: unknown if a length is, or if there is none."""
     steps = [step for step in steps if step.status is Status.OK]
-    if not all(step.scale_known for step in steps):
+    if not steps or not all(step.scale_known for step in steps):
         return Scale.UNKNOWN
     return Scale.METRIC if all(step.metric for step in steps) else Scale.RELATIVE
 

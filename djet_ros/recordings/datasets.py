@@ -17,7 +17,12 @@ from djet_ros.recordings.calibrations import (
     PLAIN,
     YAML,
 )
-from djet_ros.recordings.frame_sequence import FrameSequence, from_first, ImageFiles
+from djet_ros.recordings.frame_sequence import (
+    FrameSequence,
+    from_first,
+    IMAGE_SUFFIXES,
+    ImageFiles,
+)
 from djet_ros.recordings.imu import ImuTrack, read_asl_imu
 from djet_ros.recordings.kitti import (
     check_rigid,
@@ -56,8 +61,6 @@ SEVEN_SCENES_CAMERA = (585.0, 585.0, 320.0, 240.0)
 
 # Frame period of images without stamps: 30 Hz, as of a Kinect and of most others.
 USUAL_PERIOD_NS = 33_333_333
-
-_SUFFIXES = ('.png', '.jpg', '.jpeg')
 
 
 def tum_rgbd(folder: Path) -> FrameSequence:
@@ -180,7 +183,7 @@ def _seven_scenes_images(folder: Path) -> list[Path]:
 def _images_in(folder: Path) -> Iterable[Path]:
     """Return the image files in a folder, hidden ones excepted."""
     return (path for path in folder.glob('*')
-            if path.suffix.lower() in _SUFFIXES and not path.name.startswith('.'))
+            if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith('.'))
 
 
 def _by_numbers(path: Path) -> list[tuple[int, str]]:

@@ -11,7 +11,7 @@ from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.odometry.camera import Camera, check_lens, is_distorted
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.images import BadMessage, decoded, jpeg_size, to_8_bits
+from djet_ros.odometry.images import BadMessage, decoded, jpeg_size, JPEG_START, to_8_bits
 from djet_ros.odometry.png import LARGEST_IMAGE_PIXELS, PNG_START
 from djet_ros.recordings.imu import ImuTrack
 import numpy as np
@@ -20,11 +20,14 @@ from numpy.typing import NDArray
 # Bytes searched for the size of a JPEG: a thumbnail and a colour profile may precede it.
 _LONGEST_JPEG_HEADER = 1 << 20
 
-_JPEG_START = b'\xff\xd8'
+# Bytes of a PNG up to its size.
+_PNG_HEADER = 24
+
+IMAGE_SUFFIXES = ('.png', '.jpg', '.jpeg')
 
 
 class DamagedImage(DjetError):
-    """A file with the header of an image that can't be decoded; path: of the file."""
+    """An image file that is cut short or can't be decoded; path: of the file."""
 
     def __init__(self, path: Path, why: BadMessage) -> None:
         """Keep the path, and make the message."""
@@ -108,17 +111,28 @@ class ImageFiles:
     PNG or JPEG files of one size, decoded one at a time.
 
     The headers of all files are checked first, so that a wrong file is found before the work
-    begins.
+    begins. A damaged file, also one that is empty or cut within its header, is found when it is
+    decoded: a crashed recorder leaves one, and the others are of use.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
         """Check that all are images of one size; raise DjetError for the first that is not."""
         self.paths = tuple(paths)
-        self.size = image_size(self.paths[0])
-        for path in self.paths[1:]:
-            if (size := image_size(path)) != self.size:
+        self.size = self._common_size()
+
+    def _common_size(self) -> tuple[int, int]:
+        common: tuple[int, int] | None = None
+        for path in self.paths:
+            if (size := image_size(path)) is None:
+                continue
+            common = common or size
+            if size != common:
                 raise DjetError(f'{path} is {size[0]}x{size[1]}, the images before it are '
-                                f'{self.size[0]}x{self.size[1]}; all must have the same size')
+                                f'{common[0]}x{common[1]}; all must have the same size')
+        if common is None:
+            raise DjetError(f'no image has a header with its size: {self.paths[0]} is empty or '
+                            'cut within it; replace it')
+        return common
 
     def gray(self, index: int) -> NDArray[np.uint8]:
         """Return one image (H, W) uint8, the upper 8 bits of a 16-bit one."""
@@ -138,21 +152,27 @@ class ImageFiles:
         return image
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) from the header of a PNG or JPEG file; raise DjetError if neither."""
+def image_size(path: Path) -> tuple[int, int] | None:
+    """
+    Return (width, height) from the header of a PNG or JPEG file; raise DjetError if neither.
+
+    None if the file is damaged: empty, or without a size in its header.
+    """
     try:
         with path.open('rb') as file:
-            header = file.read(24)
-            if header.startswith(_JPEG_START):
+            header = file.read(_PNG_HEADER)
+            if header.startswith(JPEG_START):
                 header += file.read(_LONGEST_JPEG_HEADER)
     except OSError as error:
         raise DjetError(f'{path} could not be read: {error.strerror}') from error
-    if header.startswith(_JPEG_START):
+    if _is_cut(header) and path.suffix.lower() in IMAGE_SUFFIXES:
+        return None
+    if header.startswith(JPEG_START):
         try:
             width, height = jpeg_size(header)
-        except BadMessage as error:
-            raise DjetError(f'{path}: {error}') from error
-    elif header[:8] == PNG_START and header[12:16] == b'IHDR' and len(header) == 24:
+        except BadMessage:
+            return None
+    elif header[:8] == PNG_START and header[12:16] == b'IHDR' and len(header) == _PNG_HEADER:
         width, height = struct.unpack('>II', header[16:])
     else:
         raise DjetError(f'{path} is neither a PNG nor a JPEG image')
@@ -160,3 +180,9 @@ def image_size(path: Path) -> tuple[int, int]:
         raise DjetError(f'{path} declares {width}x{height} pixels, at most '
                         f'{LARGEST_IMAGE_PIXELS} are decoded')
     return width, height
+
+
+def _is_cut(header: bytes) -> bool:
+    """Return whether a file is empty or ends within its header; header: its beginning."""
+    return len(header) < _PNG_HEADER and any(
+        start.startswith(header[:len(start)]) for start in (PNG_START, JPEG_START))

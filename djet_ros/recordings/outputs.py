@@ -6,18 +6,26 @@ Nothing is replaced without ``overwrite``, and nothing that this package did not
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 import os
 from pathlib import Path
 import shutil
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp, TemporaryDirectory
 
 from djet_ros.errors import DjetError
 
 
-def check_file(path: Path, overwrite: bool, *suffixes: str) -> None:
-    """Raise DjetError if a file can't be written there, or its name has none of the suffixes."""
+def check_file(path: Path, overwrite: bool, *suffixes: str, inputs: Iterable[Path] = ()) -> None:
+    """
+    Raise DjetError if a file can't be written there, or its name has none of the suffixes.
+
+    inputs: files and folders that are read; the file may be none of them, and in none of them.
+    """
+    for given in inputs:
+        if path.resolve().is_relative_to(given.resolve()):
+            raise DjetError(f"--output is '{path}', which belongs to the input; choose another "
+                            'one')
     if path.is_dir():
         raise DjetError(f'{path} is a folder; name a file')
     if suffixes and path.suffix.lower() not in suffixes:
@@ -43,19 +51,82 @@ def make_room(folder: Path, ours: Collection[str], overwrite: bool,
     make_folder(folder)
 
 
+class SetAside:
+    """
+    What an earlier run wrote into a folder, in a hidden folder there until it is given up.
+
+    Makes room as ``make_room`` does, with its arguments and errors. A run that is killed leaves
+    it hidden.
+    """
+
+    def __init__(self, folder: Path, ours: Collection[str], overwrite: bool,
+                 marks: Collection[str] = ()) -> None:
+        """Move the files of an earlier run; all stay where they were if that fails."""
+        self._folder = folder
+        self._place: Path | None = None
+        present = check_room(folder, ours, overwrite, marks)
+        make_folder(folder)
+        if not present:
+            return
+        self._place = Path(mkdtemp(prefix='.earlier-', dir=folder))
+        try:
+            for path in present:
+                path.rename(self._place / path.name)
+        except BaseException:
+            self.put_back()
+            raise
+
+    @property
+    def kept(self) -> bool:
+        """Whether anything was set aside, and not given up."""
+        return self._place is not None
+
+    def give_up(self) -> None:
+        """Remove what was set aside, if it is still there. Raises OSError."""
+        if self._place is not None:
+            shutil.rmtree(self._place)
+            self._place = None
+
+    def put_back(self) -> None:
+        """Move it back to where it was, unless it was given up. Raises OSError."""
+        if self._place is not None:
+            for path in self._place.iterdir():
+                path.rename(self._folder / path.name)
+            self._place.rmdir()
+            self._place = None
+
+
 def check_room(folder: Path, ours: Collection[str], overwrite: bool,
                marks: Collection[str] = ()) -> list[Path]:
     """Return what ``make_room`` would remove, without removing it; raise DjetError as it does."""
     _check_obstacles(folder)
     if marks and folder.is_dir() and any(folder.iterdir()) \
             and not all((folder / mark).is_file() for mark in marks):
-        raise DjetError(f'{folder} is not empty and holds no earlier results; choose another '
-                        '--output')
+        raise _foreign(folder)
     present = [folder / name for name in ours if os.path.lexists(folder / name)]
     if present and not overwrite:
         raise DjetError(f'{folder} holds earlier results; choose another --output, or replace '
                         'them with --overwrite')
     return present
+
+
+def check_ours(folder: Path, ours: Collection[str], mark: str) -> None:
+    """
+    Raise DjetError if a folder holds files of others, such as images, but none of an earlier run.
+
+    ours: names that a run writes, of which an interrupted one leaves some; mark: the one of a
+    folder in which foreign files are accepted. Hidden files are.
+    """
+    _check_obstacles(folder)
+    if folder.is_dir() and not (folder / mark).is_file() and any(
+            path.name not in ours and not path.name.startswith('.')
+            for path in folder.iterdir()):
+        raise _foreign(folder)
+
+
+def _foreign(folder: Path) -> DjetError:
+    return DjetError(f'{folder} is not empty and holds no earlier results; choose another '
+                     '--output')
 
 
 def make_folder(folder: Path) -> None:
@@ -68,6 +139,16 @@ def make_folder(folder: Path) -> None:
                         'another --output') from error
 
 
+def check_writable(path: Path) -> None:
+    """Make the folder of a file; raise DjetError if it, or a file in it, can't be created."""
+    make_folder(path.parent)
+    try:
+        TemporaryDirectory(prefix='.djet-', dir=path.parent).cleanup()
+    except OSError as error:
+        raise DjetError(f'{path} could not be created: {error.strerror or error}; choose another '
+                        '--output') from error
+
+
 def _check_obstacles(folder: Path) -> None:
     for place in (*reversed(folder.parents), folder):
         if place.is_symlink() and not place.exists():
@@ -78,13 +159,28 @@ def _check_obstacles(folder: Path) -> None:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write or replace a text file atomically. Raises OSError."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # A new file in a temporary folder, not a temporary file: its mode follows the umask.
-    with TemporaryDirectory(prefix='.djet-', dir=path.parent) as scratch:
-        new = Path(scratch) / 'new'
+    """Write or replace a text file atomically. Raises OSError that names it."""
+    with replaced_whole(path) as new:
         new.write_text(text, 'utf-8')
-        os.replace(new, path)
+
+
+@contextmanager
+def replaced_whole(path: Path) -> Iterator[Path]:
+    """
+    Yield a path in a temporary folder, of a file that is to be ``path``; on failure that is kept.
+
+    The file has the suffix of ``path``. Raises OSError that names ``path``.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # A new file in a temporary folder, not a temporary file: its mode follows the umask.
+        with TemporaryDirectory(prefix='.djet-', dir=path.parent) as scratch:
+            new = Path(scratch) / f'new{path.suffix}'
+            yield new
+            os.replace(new, path)
+    except OSError as error:
+        # The temporary file means nothing to the user, and a full disk names none.
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
 
 
 @contextmanager

@@ -15,7 +15,7 @@ The results folder of a replay; files are written during the run, so that nothin
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, ExitStack, suppress
 import csv
 import json
 from pathlib import Path
@@ -35,7 +35,7 @@ from djet_ros.odometry.tracker import Outgoing
 from djet_ros.posegraph.steps import Step
 from djet_ros.recordings.bag_writers import ResultBag
 from djet_ros.recordings.closing import Closing
-from djet_ros.recordings.outputs import make_room, write_whole
+from djet_ros.recordings.outputs import replaced_whole, SetAside, write_whole
 from djet_ros.recordings.point_clouds import PointFile
 from djet_ros.recordings.text import LineFile
 from djet_ros.recordings.trajectories import KittiWriter, TumWriter
@@ -50,6 +50,8 @@ LANDMARKS = 'landmarks.ply'
 DEBUG = 'debug'
 _FILES = (SUMMARY, PLOT, LANDMARKS, 'trajectory_tum.txt', 'trajectory_kitti.txt', 'frames.csv',
           'errors.csv', 'config.yaml')
+# Of all that a replay writes into the folder.
+NAMES = (*_FILES, BAG, DEBUG)
 
 # The summary until the run has ended.
 UNFINISHED = {'complete': False, 'error': 'the run did not complete'}
@@ -63,9 +65,9 @@ class ResultsFolder(Closing):
     """
     Writes the results of one replay; a context manager.
 
-    Until ``finish`` the summary marks the run as incomplete. Raises DjetError if the folder
-    exists (unless it is empty, or an earlier results folder and overwrite is set) or cannot be
-    written.
+    Until ``finish`` the summary marks the run as incomplete. Earlier results are set aside, and
+    put back at the end if the new ones have no frame. Raises DjetError if the folder exists
+    (unless it is empty, or an earlier results folder and overwrite is set) or cannot be written.
     """
 
     def __init__(self, path: Path, config: Config, overwrite: bool = False) -> None:
@@ -73,13 +75,14 @@ class ResultsFolder(Closing):
         self.path = path
         present = path.exists()
         with self._beginning():
-            make_room(path, (*_FILES, BAG, DEBUG), overwrite, marks=(SUMMARY, 'config.yaml'))
+            self._earlier = SetAside(path, NAMES, overwrite, marks=(SUMMARY, 'config.yaml'))
         try:
             with self._beginning():
                 self._begin(config)
         except BaseException:
             # Without both of its marks the folder could not be overwritten later.
             self._remove(present)
+            self._earlier.put_back()
             raise
 
     def _begin(self, config: Config) -> None:
@@ -115,6 +118,10 @@ class ResultsFolder(Closing):
 
     def add_frame(self, image: int, result: OdometryResult, seconds: float) -> None:
         """Write the result of a processed image (number from 0) and its processing time."""
+        try:
+            self._earlier.give_up()
+        except OSError as error:
+            raise _blame(self.path, error) from error
         for trajectory in self._trajectories:
             trajectory.write(result.stamp_ns, result.pose)
         self._row((image, result.stamp_ns, result.status.value, '', *_details(result),
@@ -186,7 +193,8 @@ class ResultsFolder(Closing):
 
     def close(self) -> None:
         """Complete the bag and close the files."""
-        with interrupt_after():
+        with interrupt_after(), ExitStack() as at_end:
+            at_end.callback(self._keep_earlier)
             try:
                 self._table.close()
                 for trajectory in self._trajectories:
@@ -197,6 +205,12 @@ class ResultsFolder(Closing):
                 raise _blame(self.path, error) from error
             finally:
                 self._bag.close()
+
+    def _keep_earlier(self) -> None:
+        """Put the earlier results back if no image could be used."""
+        if self._earlier.kept:
+            self._remove(keep_folder=True)
+            self._earlier.put_back()
 
     def _row(self, values: tuple[Any, ...]) -> None:
         try:
@@ -268,6 +282,7 @@ def plot_trajectory(path: Path, estimate: Array, truth: Array | None,
     axes.grid(color='0.9')
     axes.legend(loc='best')
     try:
-        figure.savefig(path, dpi=120)
+        with replaced_whole(path) as new:
+            figure.savefig(new, dpi=120)
     except OSError as error:
         raise _blame(path, error) from error

@@ -42,8 +42,8 @@ from djet_ros.lab.pairs import FAILURE
 from djet_ros.lab.runner import as_completed, local_workers, run as run_chunks
 from djet_ros.lab.scenes import render_sequence, SCENES
 from djet_ros.lab.sequences import Dataset
-from djet_ros.lab.store import RecordStore
-from djet_ros.recordings.outputs import make_folder
+from djet_ros.lab.store import FILE_NAME, RecordStore
+from djet_ros.recordings.outputs import check_ours, make_folder
 from rich.table import Table
 
 DESCRIPTION = """\
@@ -52,6 +52,9 @@ the odometry, and compare the errors with the covariances: the share of poses in
 99.9 % ellipsoids, scene by scene, a reliability plot, and the list of overconfident failures.
 Rendered scenes are kept in OUTPUT/scenes. An interrupted run is resumed.
 """
+
+RESULTS = ('coverage.json', 'reliability.png')
+SCENES_FOLDER = 'scenes'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -77,9 +80,10 @@ def run(args: argparse.Namespace) -> int:
     check_least(args, workers=1, frames=2)
     if not scenes and not args.sources:
         raise DjetError('no SOURCE and no --scenes: nothing to measure; name one of them')
+    check_ours(args.output, (*RESULTS, SCENES_FOLDER), FILE_NAME)
     make_folder(args.output)
     with local_workers(args.workers) as executor:
-        rendered = _rendered(executor, args.output / 'scenes',
+        rendered = _rendered(executor, args.output / SCENES_FOLDER,
                              [(name, seed) for name in scenes for seed in args.seeds], args.frames)
         with datasets_of(args, [*args.sources, *rendered]) as datasets:
             records = _records(args, datasets, executor)
@@ -97,7 +101,7 @@ def _records(args: argparse.Namespace, datasets: Sequence[Dataset],
     config = from_flat(flag_values(args)).estimator
     settings = {'sequences': [dataset.settings() for dataset in datasets],
                 'estimator': asdict(config)}
-    with (RecordStore(args.output, Coverage, settings, ('coverage.json', 'reliability.png'),
+    with (RecordStore(args.output, Coverage, settings, RESULTS,
                       overwrite=args.overwrite) as store,
           progress_bar('pairs') as progress):
         return run_chunks(executor, started_chunks(datasets),

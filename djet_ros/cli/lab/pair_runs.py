@@ -19,9 +19,9 @@ from djet_ros.lab.methods import Method
 from djet_ros.lab.pairs import evaluate_chunk, PairRecord
 from djet_ros.lab.runner import C, chunks_of, dask_workers, local_workers, run
 from djet_ros.lab.sequences import Dataset, open_datasets, Selection
-from djet_ros.lab.store import R, RecordStore
+from djet_ros.lab.store import FILE_NAME, R, RecordStore
 from djet_ros.lab.tables import Table as ReadableTable
-from djet_ros.recordings.outputs import make_folder
+from djet_ros.recordings.outputs import check_ours, make_folder
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
@@ -74,6 +74,7 @@ def evaluated(args: argparse.Namespace, competing: Sequence[Method], results: Co
     results: see ``RecordStore``.
     """
     check_least(args, workers=1)
+    check_ours(args.output, results, FILE_NAME)
     with datasets_of(args, args.sources, args.stride) as datasets:
         make_folder(args.output)
         settings = {'sequences': [dataset.settings() for dataset in datasets],

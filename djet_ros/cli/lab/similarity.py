@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draw the figure, and print its path."""
-    check_output(args, '.png')
+    check_output(args, '.png', inputs=(args.image, args.other or args.image))
     gray = read_image(args.image)
     other = gray if args.other is None else read_image(args.other)
     points = None if args.points is None else np.array(

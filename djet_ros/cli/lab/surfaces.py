@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Draw the figure, and print its path."""
-    check_output(args, '.png', '.gif')
+    check_output(args, '.png', '.gif', inputs=(args.source, args.other) if args.other else ())
     draw = draw_trace if args.output.suffix.lower() == '.png' else animate_trace
     config = from_flat(flag_values(args)).estimator
     first, second, K = _images(args)
