@@ -122,6 +122,29 @@ def test_a_frame_that_is_no_gray_image_is_refused_with_its_shape(gray, got):
         Frame(gray, np.eye(3), 1)
 
 
+@pytest.mark.parametrize(('gray', 'got'), [
+    (None, 'NoneType'), ([[0, 0]], 'list'), (np.zeros((0, 64), np.uint8), r'\(0, 64\) uint8'),
+])
+def test_a_frame_without_an_image_is_refused(gray, got):
+    with pytest.raises(ValueError, match=f'expected a gray image .* got {got}'):
+        Frame(gray, K, 1)
+
+
+@pytest.mark.parametrize(('matrix', 'said'), [
+    (np.full((3, 3), np.nan), 'K is .*nan.* finite numbers'),
+    (np.zeros((3, 3)), r'K is \[\[0.0, .* positive fx and fy'),
+    (K.T, r'K is .* a camera matrix is \[\[fx, skew, cx\], \[0, fy, cy\]'),
+    (K * [[-1], [1], [1]], 'positive fx and fy'),
+    (None, r'camera matrix K \(3, 3\)'), (K[:2], r'K \(3, 3\), got \(2, 3\)'),
+])
+def test_a_matrix_of_no_camera_is_refused_with_its_values(matrix, said):
+    image = np.zeros((48, 64), np.uint8)
+    with pytest.raises(ValueError, match=said):
+        Frame(image, matrix, 1)
+    with pytest.raises(ValueError, match=said):
+        TwoViewEstimator(ESTIMATOR).view(image, matrix)
+
+
 @pytest.mark.slow
 def test_a_compromise_between_two_bodies_does_not_persist():
     scene = make_scene('moving_object', size=(620, 188))
