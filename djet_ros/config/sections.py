@@ -268,7 +268,7 @@ class Config:
 
     preset: str = parameter(
         'best', 'default values of the estimator: best (all improvements), fast (fewer matches, '
-        'about 0.65 of the time, for small computers) or paper (the algorithm as published); '
+        'about 0.8 of the time, for small computers) or paper (the algorithm as published); '
         'estimator parameters that are set explicitly override it', choices=PRESETS)
     estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
