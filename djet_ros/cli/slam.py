@@ -12,12 +12,10 @@ from djet_ros.cli.terminal import console, new_table, progress_bar, warn
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import with_values
 from djet_ros.config.safe_files import read_yaml
-from djet_ros.config.sections import Config, GRAPH_NAME, NODE_NAME
+from djet_ros.config.sections import Config, GRAPH_NAME, NODE_NAME, SLAM_OFFLINE
 from djet_ros.config.yaml_files import load_yaml
 from djet_ros.errors import DjetError
-from djet_ros.lab.slam_report import FILES, PLOT, write_report
 from djet_ros.libraries import problem_of
-from djet_ros.posegraph.offline import PARAMETERS, run_slam
 from djet_ros.recordings.bags import is_bag
 from djet_ros.recordings.outputs import check_room, make_folder, make_room
 from djet_ros.recordings.recording import open_recording, Recording
@@ -49,15 +47,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--source', type=Path, metavar='RECORDING',
                         help='path of the recording that RESULTS are of, if it was moved')
     add_replay_options(parser, _REPLAY_FLAGS)
-    add_flags(parser.add_argument_group('keyframes and loops'), PARAMETERS)
+    add_flags(parser.add_argument_group('keyframes and loops'), SLAM_OFFLINE)
 
 
 def run(args: argparse.Namespace) -> int:
     """Close loops, with progress on stderr, and print a summary."""
     if problem := problem_of('gtsam'):
         raise DjetError(problem)
+    # They import GTSAM, without which the help is shown and the check above is reached.
+    from djet_ros.lab.slam_report import FILES, PLOT, write_report
+    from djet_ros.posegraph.offline import run_slam
     given = flag_values(args)
-    slam_values = {name: given.pop(name) for name in PARAMETERS if name in given}
+    slam_values = {name: given.pop(name) for name in SLAM_OFFLINE if name in given}
     config = configuration(args, NODE_NAME, GRAPH_NAME)
     check_room(args.output, FILES, args.overwrite)
     results = args.input

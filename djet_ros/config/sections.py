@@ -285,3 +285,8 @@ class Config:
 
 
 SECTIONS = ('estimator', 'odometry', 'slam', 'ros')
+
+# Parameters of section slam that apply offline; the others are for live use.
+SLAM_OFFLINE = tuple(f'slam.{name}' for name in (
+    'keyframes', 'keyframe_distance', 'keyframe_turn', 'links', 'length_noise', 'loop_gap',
+    'loop_votes', 'loop_candidates', 'loop_inliers', 'loop_share'))
