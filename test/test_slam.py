@@ -819,6 +819,27 @@ def test_slam_command_keeps_earlier_results_and_parameters(closed, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(('text', 'said'), [
+    ('slam: {links: 2, loop_gap: 1000.0, image_buffer: 9}', None),
+    ('/pose_graph_node: {ros__parameters: {slam: {links: 2, loop_gap: 1000.0}}}', None),
+    ('{odometry: {scale: ground_truth}, slam: {links: 2, loop_gap: 1000.0}}', None),
+    ('{odometry: {max_gap: 3.0}, slam: {links: 2}}', 'odometry.max_gap was 1.0, and is 3.0 now'),
+    ('preset: fast', "preset was 'best', and is 'fast' now"),
+])
+def test_a_file_may_change_the_loops_of_results_and_not_their_replay(closed, tmp_path, text, said):
+    (tmp_path / 'some.yaml').write_text(text)
+    done = djet('slam', closed / 'replay', '--output', tmp_path / 'slam', *FLAGS[:4], '--config',
+                tmp_path / 'some.yaml', expect=2 if said else 0)
+    if said:
+        assert said in done.stderr
+        assert not (tmp_path / 'slam').exists()
+        return
+    parameters = json.loads((tmp_path / 'slam' / 'slam.json').read_text())['parameters']
+    assert (parameters['links'], parameters['loop_gap']) == (2, 1000.0)
+    assert parameters['keyframe_distance'] == FLAGS[3]
+
+
+@pytest.mark.slow
 def test_a_mistake_in_the_command_costs_no_earlier_results(closed, drive, tmp_path):
     shutil.copytree(closed, tmp_path / 'slam')
     before = {path: path.read_bytes() for path in (tmp_path / 'slam').rglob('*') if path.is_file()}

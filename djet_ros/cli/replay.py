@@ -92,9 +92,16 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def configuration(args: argparse.Namespace, *nodes: str) -> Config:
-    """Return the parameters of --config for the named nodes, overridden by the flags."""
-    config = load_yaml(args.config, nodes=nodes or (NODE_NAME,)) if args.config else Config()
+def configuration(args: argparse.Namespace, *nodes: str, base: Config | None = None) -> Config:
+    """
+    Return the parameters of --config for the named nodes, overridden by the flags.
+
+    base: what they override in turn, by default the defaults.
+    """
+    config = base or Config()
+    if args.config:
+        config = load_yaml(args.config, lambda _, values: with_values(config, values),
+                           nodes or (NODE_NAME,))
     return with_values(config, flag_values(args))
 
 
