@@ -696,6 +696,24 @@ def test_stationary_camera_gives_a_warning(tmp_path):
             'was stationary or only rotated') in done.stderr
 
 
+def test_a_mask_that_excludes_the_image_is_named_with_its_values(tmp_path, folder):
+    """One of 0 and 1, as segmentation writes it, would leave dark images to be blamed."""
+    file, mask = tmp_path / 'mask.png', np.ones(SIZE[::-1], np.uint8)
+    mask[200:] = 0
+    cv2.imwrite(str(file), mask)
+    replayed = ('replay', folder, '--mask-file', file, '--output', tmp_path / 'out')
+    done = djet(*replayed, expect=2)
+    assert (f'{file} excludes the whole image, or leaves no place for a feature: pixels below 128 '
+            'are excluded, and its values are 0 to 1; make 255 ') in done.stderr
+    assert not (tmp_path / 'out').exists()
+    mask[:], mask[:, :30] = 0, 255
+    cv2.imwrite(str(file), mask)
+    done = djet(*replayed)
+    assert f'none of {FRAMES - 1} pairs could be tracked (mostly TOO_FEW_MATCHES): ' in done.stderr
+    assert 'excludes 91% of the image: pixels below 128 are excluded' in done.stderr
+    assert 'exposure' not in done.stderr
+
+
 def test_images_beyond_max_gap_give_a_warning(tmp_path, bag):
     file = tmp_path / 'slow.yaml'
     file.write_text('odometry: {max_gap: 0.05}\n')
