@@ -619,6 +619,14 @@ def bad_config(tmp_path, bag):
     *[(lambda t, b, what=what: [b, f'--{what}-topic', '/some'],
        f"--{what}-topic is '/some', but the configuration does not use it; set odometry.")
       for what in ('speed', 'imu', 'guess', 'mask')],
+    *[(lambda t, b, call=call: [b, *call],
+       f"{call[-2]} is '{call[-1]}', but the configuration does not use it; set odometry.{use}, "
+       'or omit the option')
+      for *call, use in (
+          ('--camera-height', '1.65', 'scale to camera_height'),
+          ('--camera-pitch', '-2.0', 'scale to camera_height'),
+          ('--scale', 'none', '--scale-value', '3.0', 'scale to constant'),
+          ('--guess-frame', 'odom', 'guess to true or odometry.scale to guess'))],
 ])
 def test_invalid_call_is_one_line_and_exit_code_2(make, message, tmp_path, bag):
     done = djet('replay', *make(tmp_path, bag), '--output', tmp_path / 'results', expect=2)
@@ -654,6 +662,14 @@ def test_scale_of_a_file_may_have_its_length_from_a_flag(bag, tmp_path):
     file.write_text('odometry: {scale: constant}\n')
     djet('replay', bag, '--config', file, '--scale-value', '0.5', '--output', tmp_path / 'out')
     assert summary(tmp_path / 'out')['scale_kind'] == 'metric'
+
+
+def test_a_file_may_have_parameters_that_only_some_scales_use(bag, tmp_path):
+    """Cars and drones share one; a flag may also take back a value."""
+    file = tmp_path / 'fleet.yaml'
+    file.write_text('odometry: {camera_height: 1.65, scale_value: 3.0, guess_frame: odom}\n')
+    djet('replay', bag, '--config', file, '--guess-frame', '', '--output', tmp_path / 'out')
+    assert summary(tmp_path / 'out')['scale_kind'] == 'relative'
 
 
 def seen(tmp_path, frames):
