@@ -113,6 +113,13 @@ def test_the_help_of_surfaces_has_the_defaults_of_its_own_preset() -> None:
         assert f'(default: {value})' == meaning[meaning.index('(default: '):].partition(' --')[0]
 
 
+def test_a_size_beyond_the_largest_is_told_the_limit(tmp_path: Path) -> None:
+    answer = djet('lab', 'render', 'road', str(tmp_path / 'out'), '--size', '100000x100000')
+    assert answer.returncode == 2
+    assert answer.stderr == ('djet: error: --size is 100000x100000; width and height must be '
+                             'between 64 and 4096 pixels\n')
+
+
 def test_the_version_is_the_packages() -> None:
     assert djet_alone('--version').stdout == f'djet_ros {djet_ros.__version__}\n'
 
