@@ -18,7 +18,7 @@ from djet_ros.core.radial import undistort_image
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.errors import DjetError
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.scale import Length
+from djet_ros.odometry.scale import Length, Scale
 from djet_ros.odometry.uncertainty import compose, inflated_for_chain, UNKNOWN_MOTION
 from djet_ros.posegraph.keyframe_images import KeyframeFile, KeyframeImage
 from djet_ros.posegraph.loops import EdgeFinder
@@ -647,6 +647,20 @@ def test_singular_covariance_of_an_edge_is_refused_by_name(optimise):
 
 
 # Alignment
+
+def test_the_plot_of_a_straight_path_has_room_beside_it(optimise, tmp_path):
+    from djet_ros.lab.slam_report import write_report
+    from djet_ros.posegraph.keyframe_map import KeyframeOffset
+    from djet_ros.posegraph.offline import Slam
+    graph = chain(np.array([pose(z=float(i)) for i in range(60)]))
+    write_report(tmp_path, Slam(graph, [KeyframeOffset(keyframe=i) for i in range(60)],
+                                optimise(graph), Scale.METRIC),
+                 np.full((60, 4, 4), np.nan), 'drive', Config())
+    dark = cv2.imread(str(tmp_path / 'slam.png'), cv2.IMREAD_GRAYSCALE) < 64
+    # the two lines of the axes
+    assert dark.sum(0).max() > 0.7 * len(dark)
+    assert dark.sum(1).max() > 0.7 * len(dark[0])
+
 
 def test_alignment_undoes_any_motion_and_scale():
     rng = np.random.default_rng(2)

@@ -98,7 +98,9 @@ def _plot(path: Path, slam: Slam, trajectories: dict[str, Array], truth: Array |
         trajectories = {label: aligned(positions, truth[:, :3, 3], slam.metric)
                         for label, positions in trajectories.items()}
     with figure(path, 7 if truth is None else 12, 6) as page:
-        axes = page.add_subplot(1, 1 if truth is None else 2, 1, aspect='equal')
+        axes = page.add_subplot(1, 1 if truth is None else 2, 1)
+        # A straight path would make the panel as narrow as itself.
+        axes.set_aspect('equal', adjustable='datalim')
         if truth is not None:
             axes.plot(truth[:, 0, 3], truth[:, 2, 3], color='0.6', lw=3, label='ground truth')
         for label, positions in trajectories.items():
