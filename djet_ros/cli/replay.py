@@ -73,7 +73,7 @@ def add_replay_options(parser: argparse.ArgumentParser, flags: Iterable[str]) ->
     """Add the options that decide how a recording is replayed."""
     parser.add_argument('--config', type=Path, metavar='FILE',
                         help='YAML file of parameters, plain or in the layout of ROS; flags '
-                        'override it, and --preset overrides all its estimator.* values')
+                        'override it, --preset all its estimator.* values')
     add_flags(parser, flags)
     parser.add_argument('--poses', type=Path, metavar='FILE',
                         help="ground truth, in place of the recording's own: a TUM file, or a "

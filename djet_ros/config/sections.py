@@ -269,7 +269,8 @@ class Config:
     preset: str = parameter(
         'best', 'default values of the estimator: best (all improvements), fast (fewer matches, '
         'about 0.8 of the time, for small computers) or paper (the algorithm as published); '
-        'estimator parameters that are set explicitly override it', choices=PRESETS)
+        'it is overridden by estimator parameters in the same file and by flags; as a flag it '
+        'overrides those of a file', choices=PRESETS)
     estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     slam: SlamConfig = field(default_factory=SlamConfig)
