@@ -89,6 +89,21 @@ def test_a_process_shows_help_where_only_ascii_is_possible() -> None:
     assert answer.stdout.startswith('usage: djet slam ')
 
 
+def test_without_gtsam_slam_shows_its_help_and_says_how_to_install_it() -> None:
+    def slam(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, '-c', f"import sys; sys.modules['gtsam'] = None; {DJET}", 'slam',
+             *arguments], capture_output=True, text=True, timeout=60, check=False)
+
+    helped = slam('--help')
+    assert (helped.returncode, helped.stderr) == (0, '')
+    assert '--loop-gap' in helped.stdout
+    refused = slam('results')
+    assert refused.returncode == 2
+    assert refused.stderr.startswith('djet: error: gtsam is missing: pip install ')
+    assert 'djet_ros[slam]' in refused.stderr
+
+
 def test_the_help_of_surfaces_has_the_defaults_of_its_own_preset() -> None:
     message = ' '.join(djet('lab', 'surfaces', '--help').stdout.split())
     assert '(default: paper, ' in message
@@ -96,6 +111,13 @@ def test_the_help_of_surfaces_has_the_defaults_of_its_own_preset() -> None:
                         ('step', "'share'"), ('step-share', 0.3)):
         _, _, meaning = message.rpartition(f' --{name} ')
         assert f'(default: {value})' == meaning[meaning.index('(default: '):].partition(' --')[0]
+
+
+def test_a_size_beyond_the_largest_is_told_the_limit(tmp_path: Path) -> None:
+    answer = djet('lab', 'render', 'road', str(tmp_path / 'out'), '--size', '100000x100000')
+    assert answer.returncode == 2
+    assert answer.stderr == ('djet: error: --size is 100000x100000; width and height must be '
+                             'between 64 and 4096 pixels\n')
 
 
 def test_the_version_is_the_packages() -> None:

@@ -727,7 +727,7 @@ def test_an_image_other_than_8_bit_gray_is_rejected(image):
 
 
 def test_a_wrong_camera_matrix_is_rejected():
-    with pytest.raises(ValueError, match='and K'):
+    with pytest.raises(ValueError, match='camera matrix K'):
         TwoViewEstimator().view(np.zeros((40, 60), np.uint8), np.eye(3, 4))
 
 

@@ -353,8 +353,9 @@ def test_a_folder_of_sequences_gives_all_of_them_with_distinct_names(road, tmp_p
         shutil.copytree(road, tmp_path / 'sequences' / name)
         (tmp_path / 'poses').mkdir(exist_ok=True)
         shutil.copy(road.parent.parent / 'poses' / '00.txt', tmp_path / 'poses' / f'{name}.txt')
-    sources = open_datasets([tmp_path], Selection(), tmp_path)
-    assert [source.name for source in sources] == ['road', 'road-2']
+    for folder in (tmp_path, tmp_path / 'sequences'):
+        sources = open_datasets([folder], Selection(), tmp_path)
+        assert [source.name for source in sources] == ['road', 'road-2']
 
 
 # Running on workers

@@ -153,6 +153,7 @@ def test_two_images_and_a_camera_give_the_same_as_a_sequence(road, tmp_path, cap
     (['surfaces', 'image', 'image', '--camera', '0,1,1,1'], 'focal lengths must be positive'),
     (['surfaces', 'flat', 'flat', '--camera', '9,9,9,9'],
      'have 0 matches, at least 20 are needed'),
+    (['surfaces', 'road', '--camera', '9,9,9,9'], 'has a calibration of its own; omit the option'),
     (['surfaces', 'road', '--pair', '2'], '--pair is 2'),
     (['surfaces', 'single'], 'has one image; name a recording with two or more'),
     (['surfaces', 'road', '--match', '99999'], '--match is 99999; this pair has matches 0 to'),

@@ -353,6 +353,31 @@ def test_images_without_a_calibration_are_told_what_they_need(images: Path) -> N
         open_sequence(images)
 
 
+@pytest.mark.parametrize(('text', 'holds'), [
+    ('100 101 80\n', '3 numbers in one line'),
+    ('100 101 80 60 0.1 0 0 0 0 0\n', '10 numbers in one line'),
+    ('100 101 80 60 640 480 0 0 0 0 0\n', '11 numbers in one line'),
+    ('100\n101\n80\n60\n', '4 numbers in 4 lines'),
+    ('100 0 80\n0 101 60\n0 0 1\n', '9 numbers in 3 lines'),
+    ('100 101 80 60\n0.1 0 0 0\n', '8 numbers in 2 lines'),
+    ('# fx fy cx cy\n', '0 numbers in 0 lines'),
+])
+def test_a_calibration_of_another_form_is_told_what_it_holds_and_must_hold(
+        images: Path, text: str, holds: str) -> None:
+    (images / 'calibration.yaml').unlink()
+    (images / 'calibration.txt').write_text(text)
+    with pytest.raises(DjetError, match=f'calibration.txt holds {holds}; it must hold one line '
+                                        "'fx fy cx cy' in pixels, perhaps with"):
+        open_sequence(images)
+
+
+def test_images_of_other_formats_are_told_which_are_read(images: Path) -> None:
+    for path in images.glob('frame*'):
+        path.rename(path.with_suffix('.tiff'))
+    with pytest.raises(DjetError, match='has a calibration, but no image: PNG and JPEG are read'):
+        open_sequence(images)
+
+
 # KITTI raw
 
 P_RECT = [50.0, 0, 80, 0, 0, 50, 60, 0, 0, 0, 1, 0]

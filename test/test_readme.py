@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 from functools import cache
+import json
 from pathlib import Path
 import re
 import shlex
@@ -49,6 +50,13 @@ def exists(test: str) -> bool:
 
 def test_the_readme_is_short():
     assert len((ROOT / 'README.md').read_bytes()) <= 8000
+
+
+def test_the_printed_distortion_of_a_drive_is_the_measured_one():
+    part = json.loads((DOC / 'results.json').read_text())['parts']['drive kitti 03']['lens']
+    page = (DOC / 'scale.md').read_text()
+    assert f'k1 = {part["k1"]:.4f} +- {part["sigma"]:.4f}, from ' in page
+    assert set(re.findall(r'--residual-k1 ([\d.]+)', page)) == {f'{part["k1"]:.5f}'}
 
 
 def examples(page):

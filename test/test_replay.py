@@ -634,6 +634,14 @@ def bad_config(tmp_path, bag):
     *[(lambda t, b, what=what: [b, f'--{what}-topic', '/some'],
        f"--{what}-topic is '/some', but the configuration does not use it; set odometry.")
       for what in ('speed', 'imu', 'guess', 'mask')],
+    *[(lambda t, b, call=call: [b, *call],
+       f"{call[-2]} is '{call[-1]}', but the configuration does not use it; set odometry.{use}, "
+       'or omit the option')
+      for *call, use in (
+          ('--camera-height', '1.65', 'scale to camera_height'),
+          ('--camera-pitch', '-2.0', 'scale to camera_height'),
+          ('--scale', 'none', '--scale-value', '3.0', 'scale to constant'),
+          ('--guess-frame', 'odom', 'guess to true or odometry.scale to guess'))],
 ])
 def test_invalid_call_is_one_line_and_exit_code_2(make, message, tmp_path, bag):
     done = djet('replay', *make(tmp_path, bag), '--output', tmp_path / 'results', expect=2)
@@ -669,6 +677,14 @@ def test_scale_of_a_file_may_have_its_length_from_a_flag(bag, tmp_path):
     file.write_text('odometry: {scale: constant}\n')
     djet('replay', bag, '--config', file, '--scale-value', '0.5', '--output', tmp_path / 'out')
     assert summary(tmp_path / 'out')['scale_kind'] == 'metric'
+
+
+def test_a_file_may_have_parameters_that_only_some_scales_use(bag, tmp_path):
+    """Cars and drones share one; a flag may also take back a value."""
+    file = tmp_path / 'fleet.yaml'
+    file.write_text('odometry: {camera_height: 1.65, scale_value: 3.0, guess_frame: odom}\n')
+    djet('replay', bag, '--config', file, '--guess-frame', '', '--output', tmp_path / 'out')
+    assert summary(tmp_path / 'out')['scale_kind'] == 'relative'
 
 
 def seen(tmp_path, frames):
@@ -710,6 +726,24 @@ def test_stationary_camera_gives_a_warning(tmp_path):
     done = djet('replay', source, '--output', tmp_path / 'out')
     assert (f'djet: warning: all {FRAMES - 1} pairs have no parallax (NO_PARALLAX): the camera '
             'was stationary or only rotated') in done.stderr
+
+
+def test_a_mask_that_excludes_the_image_is_named_with_its_values(tmp_path, folder):
+    """One of 0 and 1, as segmentation writes it, would leave dark images to be blamed."""
+    file, mask = tmp_path / 'mask.png', np.ones(SIZE[::-1], np.uint8)
+    mask[200:] = 0
+    cv2.imwrite(str(file), mask)
+    replayed = ('replay', folder, '--mask-file', file, '--output', tmp_path / 'out')
+    done = djet(*replayed, expect=2)
+    assert (f'{file} excludes the whole image, or leaves no place for a feature: pixels below 128 '
+            'are excluded, and its values are 0 to 1; make 255 ') in done.stderr
+    assert not (tmp_path / 'out').exists()
+    mask[:], mask[:, :30] = 0, 255
+    cv2.imwrite(str(file), mask)
+    done = djet(*replayed)
+    assert f'none of {FRAMES - 1} pairs could be tracked (mostly TOO_FEW_MATCHES): ' in done.stderr
+    assert 'excludes 91% of the image: pixels below 128 are excluded' in done.stderr
+    assert 'exposure' not in done.stderr
 
 
 def test_images_beyond_max_gap_give_a_warning(tmp_path, bag):

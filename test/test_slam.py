@@ -18,7 +18,7 @@ from djet_ros.core.radial import undistort_image
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.errors import DjetError
 from djet_ros.odometry.frame import Frame
-from djet_ros.odometry.scale import Length
+from djet_ros.odometry.scale import Length, Scale
 from djet_ros.odometry.uncertainty import compose, inflated_for_chain, UNKNOWN_MOTION
 from djet_ros.posegraph.keyframe_images import KeyframeFile, KeyframeImage
 from djet_ros.posegraph.loops import EdgeFinder
@@ -648,6 +648,20 @@ def test_singular_covariance_of_an_edge_is_refused_by_name(optimise):
 
 # Alignment
 
+def test_the_plot_of_a_straight_path_has_room_beside_it(optimise, tmp_path):
+    from djet_ros.lab.slam_report import write_report
+    from djet_ros.posegraph.keyframe_map import KeyframeOffset
+    from djet_ros.posegraph.offline import Slam
+    graph = chain(np.array([pose(z=float(i)) for i in range(60)]))
+    write_report(tmp_path, Slam(graph, [KeyframeOffset(keyframe=i) for i in range(60)],
+                                optimise(graph), Scale.METRIC),
+                 np.full((60, 4, 4), np.nan), 'drive', Config())
+    dark = cv2.imread(str(tmp_path / 'slam.png'), cv2.IMREAD_GRAYSCALE) < 64
+    # the two lines of the axes
+    assert dark.sum(0).max() > 0.7 * len(dark)
+    assert dark.sum(1).max() > 0.7 * len(dark[0])
+
+
 def test_alignment_undoes_any_motion_and_scale():
     rng = np.random.default_rng(2)
     truth = rng.normal(size=(20, 3))
@@ -816,6 +830,27 @@ def test_slam_command_keeps_earlier_results_and_parameters(closed, tmp_path):
     refused = djet('slam', closed / 'replay', '--output', tmp_path / 'x', '--scale', 'constant',
                    expect=2)
     assert 'whose parameters cannot be changed' in refused.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(('text', 'said'), [
+    ('slam: {links: 2, loop_gap: 1000.0, image_buffer: 9}', None),
+    ('/pose_graph_node: {ros__parameters: {slam: {links: 2, loop_gap: 1000.0}}}', None),
+    ('{odometry: {scale: ground_truth}, slam: {links: 2, loop_gap: 1000.0}}', None),
+    ('{odometry: {max_gap: 3.0}, slam: {links: 2}}', 'odometry.max_gap was 1.0, and is 3.0 now'),
+    ('preset: fast', "preset was 'best', and is 'fast' now"),
+])
+def test_a_file_may_change_the_loops_of_results_and_not_their_replay(closed, tmp_path, text, said):
+    (tmp_path / 'some.yaml').write_text(text)
+    done = djet('slam', closed / 'replay', '--output', tmp_path / 'slam', *FLAGS[:4], '--config',
+                tmp_path / 'some.yaml', expect=2 if said else 0)
+    if said:
+        assert said in done.stderr
+        assert not (tmp_path / 'slam').exists()
+        return
+    parameters = json.loads((tmp_path / 'slam' / 'slam.json').read_text())['parameters']
+    assert (parameters['links'], parameters['loop_gap']) == (2, 1000.0)
+    assert parameters['keyframe_distance'] == FLAGS[3]
 
 
 @pytest.mark.slow

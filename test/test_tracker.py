@@ -494,6 +494,19 @@ def test_few_gray_levels_of_12_bits_are_reported_and_corrected_by_the_range(driv
     assert problems_of(one)[2] == {}
 
 
+def test_masks_that_exclude_the_images_are_reported(drive):
+    one, seen = tracker(**{'odometry.mask': True}), []
+    for i, gray in enumerate(drive):
+        # Only the last one has 255 for what is to be used.
+        mask = np.full(gray.shape, 255 if i == len(drive) - 1 else 1, np.uint8)
+        one.mask(image(mask, 'mono8', ns(0.1 * i)))
+        one.image(image(gray, 'mono8', ns(0.1 * i)))
+        seen.append(problems_of(one)[2].get('mask excludes the image', ''))
+    assert seen[:4] == [''] * 4
+    assert seen[-1] == ''
+    assert all('excludes 100% of the image: pixels below 128 are' in text for text in seen[4:-1])
+
+
 def test_a_change_of_the_gray_range_applies_to_an_image_prepared_before(drive):
     message = image(drive[0].astype('<u2') * 16, 'mono16', 1)
     one = tracker()

@@ -122,6 +122,51 @@ def test_a_frame_that_is_no_gray_image_is_refused_with_its_shape(gray, got):
         Frame(gray, np.eye(3), 1)
 
 
+@pytest.mark.parametrize(('gray', 'got'), [
+    (None, 'NoneType'), ([[0, 0]], 'list'), (np.zeros((0, 64), np.uint8), r'\(0, 64\) uint8'),
+])
+def test_a_frame_without_an_image_is_refused(gray, got):
+    with pytest.raises(ValueError, match=f'expected a gray image .* got {got}'):
+        Frame(gray, K, 1)
+
+
+@pytest.mark.parametrize(('matrix', 'said'), [
+    (np.full((3, 3), np.nan), 'K is .*nan.* finite numbers'),
+    (np.zeros((3, 3)), r'K is \[\[0.0, .* positive fx and fy'),
+    (K.T, r'K is .* a camera matrix is \[\[fx, skew, cx\], \[0, fy, cy\]'),
+    (K * [[-1], [1], [1]], 'positive fx and fy'),
+    (None, r'camera matrix K \(3, 3\)'), (K[:2], r'K \(3, 3\), got \(2, 3\)'),
+])
+def test_a_matrix_of_no_camera_is_refused_with_its_values(matrix, said):
+    image = np.zeros((48, 64), np.uint8)
+    with pytest.raises(ValueError, match=said):
+        Frame(image, matrix, 1)
+    with pytest.raises(ValueError, match=said):
+        TwoViewEstimator(ESTIMATOR).view(image, matrix)
+
+
+def test_one_buffer_may_hold_all_images_in_turn(cards):
+    """As cameras are read: the trajectory would be that of one image, without a word."""
+    images = [cards.gray(pose(x=0.2 * i)) for i in range(3)]
+    buffer, matrix, left_out = np.empty_like(images[0]), K.copy(), np.empty(images[0].shape, bool)
+
+    def read(i):
+        """Overwrite the buffers, all values of which are others in between."""
+        buffer[:], matrix[:], left_out[:] = images[i], K, False
+        frame = Frame(buffer, matrix, i * 10**8, left_out=left_out)
+        buffer[:], matrix[:], left_out[:] = 0, np.nan, True
+        return frame
+
+    separate, together = odometry(), odometry()
+    for i, image in enumerate(images):
+        before = separate.process(Frame(image, K, i * 10**8,
+                                        left_out=np.zeros(image.shape, bool)))
+        after = together.process(read(i))
+        assert after.status is before.status
+        assert np.array_equal(after.pose, before.pose)
+    assert after.status is Status.OK
+
+
 @pytest.mark.slow
 def test_a_compromise_between_two_bodies_does_not_persist():
     scene = make_scene('moving_object', size=(620, 188))

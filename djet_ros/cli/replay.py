@@ -47,6 +47,12 @@ _ENABLED_BY = {'speed': 'odometry.scale to speed', 'imu': 'odometry.imu to true'
                'guess_frame',
                'mask': 'odometry.mask to true'}
 
+# The same for parameters that only some configurations use.
+_USED_WITH = {'odometry.scale_value': 'odometry.scale to constant',
+              'odometry.camera_height': 'odometry.scale to camera_height',
+              'odometry.camera_pitch': 'odometry.scale to camera_height',
+              'odometry.guess_frame': 'odometry.guess to true or odometry.scale to guess'}
+
 # Scale of a trajectory, as printed.
 _SCALES = {Scale.METRIC: 'metric', Scale.RELATIVE: 'relative, in units of the first step',
            Scale.UNKNOWN: 'unknown'}
@@ -67,7 +73,7 @@ def add_replay_options(parser: argparse.ArgumentParser, flags: Iterable[str]) ->
     """Add the options that decide how a recording is replayed."""
     parser.add_argument('--config', type=Path, metavar='FILE',
                         help='YAML file of parameters, plain or in the layout of ROS; flags '
-                        'override it, and --preset overrides all its estimator.* values')
+                        'override it, --preset all its estimator.* values')
     add_flags(parser, flags)
     parser.add_argument('--poses', type=Path, metavar='FILE',
                         help="ground truth, in place of the recording's own: a TUM file, or a "
@@ -92,9 +98,16 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def configuration(args: argparse.Namespace, *nodes: str) -> Config:
-    """Return the parameters of --config for the named nodes, overridden by the flags."""
-    config = load_yaml(args.config, nodes=nodes or (NODE_NAME,)) if args.config else Config()
+def configuration(args: argparse.Namespace, *nodes: str, base: Config | None = None) -> Config:
+    """
+    Return the parameters of --config for the named nodes, overridden by the flags.
+
+    base: what they override in turn, by default the defaults.
+    """
+    config = base or Config()
+    if args.config:
+        config = load_yaml(args.config, lambda _, values: with_values(config, values),
+                           nodes or (NODE_NAME,))
     return with_values(config, flag_values(args))
 
 
@@ -109,6 +122,7 @@ def opened_replay(args: argparse.Namespace, config: Config, recording: Path, fol
     """
     wanted = _auxiliary_inputs(config.odometry)
     check_topics(args, wanted)
+    _check_flags(args, config.odometry)
     with open_recording(recording, args.image_topic, args.info_topic, args.poses,
                         auxiliary={what: getattr(args, f'{what}_topic', None)
                                    for what in wanted}, damaged=True) as source:
@@ -123,8 +137,25 @@ def check_topics(args: argparse.Namespace, wanted: Collection[str]) -> None:
     for what, setting in _ENABLED_BY.items():
         topic = getattr(args, f'{what}_topic', None)
         if topic is not None and what not in wanted:
-            raise DjetError(f"--{what}-topic is '{topic}', but the configuration does not use "
-                            f'it; set {setting}, or omit the option')
+            raise _unused(f'--{what}-topic', topic, setting)
+
+
+def _check_flags(args: argparse.Namespace, config: OdometryConfig) -> None:
+    """Raise DjetError for a flag without effect; files are shared by several configurations."""
+    used = {'odometry.scale_value': config.scale == 'constant',
+            'odometry.camera_height': config.scale == 'camera_height',
+            'odometry.camera_pitch': config.scale == 'camera_height',
+            'odometry.guess_frame': config.guess_by_tf}
+    for name, value in flag_values(args).items():
+        # Zero and '' take back what a file says.
+        if value and not used.get(name, True):
+            raise _unused(f'--{name.rpartition(".")[2].replace("_", "-")}', value,
+                          _USED_WITH[name])
+
+
+def _unused(option: str, given: object, setting: str) -> DjetError:
+    return DjetError(f"{option} is '{given}', but the configuration does not use it; set "
+                     f'{setting}, or omit the option')
 
 
 def _auxiliary_inputs(config: OdometryConfig) -> list[str]:

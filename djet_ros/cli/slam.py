@@ -9,15 +9,13 @@ from typing import Any
 from djet_ros.cli.options import add_output
 from djet_ros.cli.replay import add_replay_options, check_topics, configuration, opened_replay
 from djet_ros.cli.terminal import console, new_table, progress_bar, warn
-from djet_ros.config.flags import add_flags, flag_values
-from djet_ros.config.flat import with_values
+from djet_ros.config.flags import add_flags
+from djet_ros.config.flat import flat, shown
 from djet_ros.config.safe_files import read_yaml
-from djet_ros.config.sections import Config, GRAPH_NAME, NODE_NAME
+from djet_ros.config.sections import Config, GRAPH_NAME, NODE_NAME, SLAM_OFFLINE
 from djet_ros.config.yaml_files import load_yaml
 from djet_ros.errors import DjetError
-from djet_ros.lab.slam_report import FILES, PLOT, write_report
 from djet_ros.libraries import problem_of
-from djet_ros.posegraph.offline import PARAMETERS, run_slam
 from djet_ros.recordings.bags import is_bag
 from djet_ros.recordings.outputs import check_room, make_folder, make_room
 from djet_ros.recordings.recording import open_recording, Recording
@@ -49,23 +47,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--source', type=Path, metavar='RECORDING',
                         help='path of the recording that RESULTS are of, if it was moved')
     add_replay_options(parser, _REPLAY_FLAGS)
-    add_flags(parser.add_argument_group('keyframes and loops'), PARAMETERS)
+    add_flags(parser.add_argument_group('keyframes and loops'), SLAM_OFFLINE)
 
 
 def run(args: argparse.Namespace) -> int:
     """Close loops, with progress on stderr, and print a summary."""
     if problem := problem_of('gtsam'):
         raise DjetError(problem)
-    given = flag_values(args)
-    slam_values = {name: given.pop(name) for name in PARAMETERS if name in given}
-    config = configuration(args, NODE_NAME, GRAPH_NAME)
+    # They import GTSAM, without which the help is shown and the check above is reached.
+    from djet_ros.lab.slam_report import FILES, PLOT, write_report
+    from djet_ros.posegraph.offline import run_slam
     check_room(args.output, FILES, args.overwrite)
     results = args.input
     if (results / 'frames.csv').is_file():
-        if args.config or given:
-            raise DjetError(f'{results} holds the results of a replay, whose parameters cannot '
-                            'be changed; name the recording, to replay it with others')
+        config = _with_loop_parameters(args, results)
     else:
+        config = configuration(args, NODE_NAME, GRAPH_NAME)
         results = args.output / 'replay'
         with opened_replay(args, config, args.input, results) as replay:
             # Earlier results of slam would not belong to the new replay.
@@ -73,7 +70,6 @@ def run(args: argparse.Namespace) -> int:
             outcome = replay()
         if outcome.problem:
             raise DjetError(outcome.problem)
-    config = with_values(load_yaml(results / 'config.yaml'), slam_values)
     source, name = _source(results, args, config)
     try:
         steps = read_steps(results, warn)
@@ -91,6 +87,20 @@ def run(args: argparse.Namespace) -> int:
               'not have its landmarks')
     print(f'results: {args.output}\nplot: {args.output / PLOT}')
     return 0
+
+
+def _with_loop_parameters(args: argparse.Namespace, results: Path) -> Config:
+    """Return the parameters of a replay, of which --config and flags may change slam.* only."""
+    replayed = load_yaml(results / 'config.yaml')
+    config = configuration(args, NODE_NAME, GRAPH_NAME, base=replayed)
+    wanted = flat(config)
+    for name, item in flat(replayed).items():
+        if wanted[name].value != item.value and not name.startswith('slam.'):
+            raise DjetError(f'{results} holds the results of a replay, whose parameters cannot be '
+                            f'changed, but those of slam: {name} was {shown(item.value)}, and is '
+                            f'{shown(wanted[name].value)} now; name the recording, to replay it '
+                            'so')
+    return config
 
 
 def _source(results: Path, args: argparse.Namespace, config: Config) -> tuple[Recording, str]:

@@ -268,8 +268,9 @@ class Config:
 
     preset: str = parameter(
         'best', 'default values of the estimator: best (all improvements), fast (fewer matches, '
-        'about 0.65 of the time, for small computers) or paper (the algorithm as published); '
-        'estimator parameters that are set explicitly override it', choices=PRESETS)
+        'about 0.8 of the time, for small computers) or paper (the algorithm as published); '
+        'it is overridden by estimator parameters in the same file and by flags; as a flag it '
+        'overrides those of a file', choices=PRESETS)
     estimator: EstimatorConfig = field(default_factory=EstimatorConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     slam: SlamConfig = field(default_factory=SlamConfig)
@@ -285,3 +286,8 @@ class Config:
 
 
 SECTIONS = ('estimator', 'odometry', 'slam', 'ros')
+
+# Parameters of section slam that apply offline; the others are for live use.
+SLAM_OFFLINE = tuple(f'slam.{name}' for name in (
+    'keyframes', 'keyframe_distance', 'keyframe_turn', 'links', 'length_noise', 'loop_gap',
+    'loop_votes', 'loop_candidates', 'loop_inliers', 'loop_share'))

@@ -17,7 +17,7 @@ class EstimatorConfig:
     Parameters of the estimation of a pair, from two images to a pose.
 
     The defaults are the preset ``best`` (everything known to help); ``preset('fast')`` takes about
-    0.65 of the time, and ``preset('paper')`` gives the algorithm as printed. Raises ValueError on
+    0.8 of the time, and ``preset('paper')`` gives the algorithm as printed. Raises ValueError on
     a value outside its described range.
     """
 
@@ -50,8 +50,8 @@ class EstimatorConfig:
         'homographies, previous motion, pure forward motion; all matches)',
         choices=('several', 'five_point'))
     window: int = parameter(
-        5, 'side of the square in which a residual surface is sampled, in pixels; if the reference is '
-        'warped, 3',
+        5, 'side of the square in which a residual surface is sampled, in pixels; if the '
+        'reference is warped, 3',
         minimum=3, maximum=15, odd=True)
     window_sigma: float = parameter(
         1.0, 'standard deviation of the Gaussian weights of the samples in the quadratic fit, in '
@@ -75,8 +75,8 @@ class EstimatorConfig:
         'project', 'surfaces without a minimum: project (onto the positive cone), drop (the '
         'match), or keep (as printed)', choices=('project', 'drop', 'keep'))
     cull_outside: bool = parameter(
-        True, 'leave out matches whose surface has its minimum farther than half a window from where '
-        'it was sampled')
+        True, 'leave out matches whose surface has its minimum farther than half a window from '
+        'where it was sampled')
     weigh_by_fit: bool = parameter(
         True, 'weight each match by the residual that remains at the minimum of its surface')
     # chosen: 5, about a window. Closer to the epipole, a match that fits by chance would fix the

@@ -112,10 +112,18 @@ def of_same_camera(one: Picture, other: Picture) -> bool:
 
 
 def require_gray(gray: NDArray[np.uint8], K: Array) -> None:
-    """Raise ValueError unless an image is (H, W) uint8 and K (3, 3)."""
-    if gray.ndim != 2 or gray.dtype != np.uint8 or K.shape != (3, 3):
-        raise ValueError('expected a gray image (H, W) uint8 and K (3, 3), got '
-                         f'{gray.shape} {gray.dtype} and {K.shape}')
+    """Raise ValueError unless an image is (H, W) uint8, not empty, and K (3, 3) of a camera."""
+    if not isinstance(gray, np.ndarray) or gray.ndim != 2 or gray.dtype != np.uint8 \
+            or not gray.size:
+        got = (f'{gray.shape} {gray.dtype}' if isinstance(gray, np.ndarray)
+               else type(gray).__name__)
+        raise ValueError(f'expected a gray image (H, W) uint8, got {got}')
+    if K.shape != (3, 3):
+        raise ValueError(f'expected the camera matrix K (3, 3), got {K.shape}')
+    if not (np.isfinite(K).all() and min(K[0, 0], K[1, 1]) > 0
+            and np.array_equal(K[[1, 2, 2, 2], [0, 0, 1, 2]], (0, 0, 0, 1))):
+        raise ValueError(f'K is {K.tolist()}; a camera matrix is [[fx, skew, cx], [0, fy, cy], '
+                         '[0, 0, 1]] of finite numbers, with positive fx and fy')
 
 
 @dataclass(frozen=True)

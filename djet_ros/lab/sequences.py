@@ -128,8 +128,9 @@ def _dataset(path: Path, name: str, selection: Selection, workspace: Path, warn:
 
 
 def _sequences(path: Path) -> Iterator[Path]:
-    """Yield the sequences of a benchmark folder, or the path itself."""
-    inner = sorted(image_folder.parent for image_folder in path.glob('sequences/*/image_0'))
+    """Yield the sequences of a benchmark folder or of its folder sequences, or the path itself."""
+    inner = sorted(image_folder.parent for form in ('sequences/*/image_0', '*/image_0')
+                   for image_folder in path.glob(form))
     yield from inner or [path]
 
 

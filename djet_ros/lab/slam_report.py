@@ -11,14 +11,14 @@ from typing import Any
 
 from djet_ros import __version__
 from djet_ros.config.flat import flat
-from djet_ros.config.sections import Config
+from djet_ros.config.sections import Config, SLAM_OFFLINE
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError, one_line
 from djet_ros.lab.evo import trajectory_metrics
 from djet_ros.lab.integration import StampedTrajectory
 from djet_ros.lab.style import COLOURS, figure
 from djet_ros.posegraph.graph_files import write_graph
-from djet_ros.posegraph.offline import PARAMETERS, Slam
+from djet_ros.posegraph.offline import Slam
 from djet_ros.recordings.outputs import write_whole
 from djet_ros.replay.alignment import aligned, position_rmse
 from djet_ros.replay.drift import path_length
@@ -48,7 +48,7 @@ def write_report(folder: Path, slam: Slam, truth: Array, name: str,
     for kind in ('g2o', 'csv'):
         write_graph(slam.optimised.accepted, folder / f'pose_graph.{kind}', kind)
     values = flat(config)
-    parameters = {full.removeprefix('slam.'): values[full].value for full in PARAMETERS}
+    parameters = {full.removeprefix('slam.'): values[full].value for full in SLAM_OFFLINE}
     kinds = Counter(edge.kind for edge in graph.edges)
     summary: dict[str, Any] = {
         'source': name, 'scale': config.odometry.scale, 'scale_kind': slam.scale.value,
@@ -98,7 +98,9 @@ def _plot(path: Path, slam: Slam, trajectories: dict[str, Array], truth: Array |
         trajectories = {label: aligned(positions, truth[:, :3, 3], slam.metric)
                         for label, positions in trajectories.items()}
     with figure(path, 7 if truth is None else 12, 6) as page:
-        axes = page.add_subplot(1, 1 if truth is None else 2, 1, aspect='equal')
+        axes = page.add_subplot(1, 1 if truth is None else 2, 1)
+        # A straight path would make the panel as narrow as itself.
+        axes.set_aspect('equal', adjustable='datalim')
         if truth is not None:
             axes.plot(truth[:, 0, 3], truth[:, 2, 3], color='0.6', lw=3, label='ground truth')
         for label, positions in trajectories.items():

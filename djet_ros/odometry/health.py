@@ -9,9 +9,12 @@ from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Status, TRACKED
 from djet_ros.odometry.images import FewLevels
+from djet_ros.odometry.masks import FREE
 from djet_ros.odometry.messages import camera_frame, mounted_frame, seconds_text
 from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.scale import Scale, ScaleSource
+import numpy as np
+from numpy.typing import NDArray
 
 # Newest images over which shares are taken, and the number below which they are zero.
 _WINDOW, _FEW = 100, 20
@@ -21,6 +24,9 @@ _SHARE = 0.1
 
 # Images or pairs in a row from which on something is a problem.
 _IN_A_ROW = 5
+
+# Share of the pixels from which on a mask is hardly meant.
+_MASKED = 0.9
 
 # Remedies for a scale source without measurements.
 _REMEDIES = {
@@ -67,6 +73,8 @@ class Health:
         # The most images in a row with one stamp, and that stamp.
         self._most_equal, self._stood_ns = 0, 0
         self._few_levels: FewLevels | None = None
+        # Excluded share of the newest image, and images in a row of which nearly all is.
+        self._masked, self._masked_in_a_row = 0.0, 0
         self._last: OdometryResult | None = None
 
     def configure(self, config: OdometryConfig) -> None:
@@ -86,10 +94,17 @@ class Health:
         self._changes.append(self._image_frame not in (None, image_frame))
         self._image_frame = image_frame
 
-    def image(self, few_levels: FewLevels | None) -> None:
-        """Note an image; few_levels: None unless it has few gray levels of its 16 bits."""
+    def image(self, few_levels: FewLevels | None, left_out: NDArray[np.bool_] | None) -> None:
+        """
+        Note an image.
+
+        few_levels: None unless it has few gray levels of its 16 bits; left_out: (H, W) bool, its
+        excluded pixels, or None.
+        """
         self._few_levels = few_levels
         self._few_in_a_row = 0 if few_levels is None else self._few_in_a_row + 1
+        self._masked = 0.0 if left_out is None else np.count_nonzero(left_out) / left_out.size
+        self._masked_in_a_row = self._masked_in_a_row + 1 if self._masked > _MASKED else 0
 
     def processed(self, result: OdometryResult) -> None:
         """Take the result of an image."""
@@ -107,7 +122,7 @@ class Health:
     def complaints(self, scale: ScaleSource, mounted: bool) -> list[Complaint]:
         """Return the present problems; mounted: whether base_frame is known, if it is needed."""
         return [one for one in (
-            self._stamps(), self.few_levels(), self._frame(),
+            self._stamps(), self.few_levels(), self.masked(), self._frame(),
             None if mounted else self._mounting(), self._length(scale), self._load(),
             self._way(), self._order(), self.two_cameras()) if one is not None]
 
@@ -127,6 +142,16 @@ class Health:
             f'{self._few_in_a_row} images of 16 bits in a row became {levels} gray levels with '
             f'odometry.gray_range {self._config.gray_range}; their values lie between {low} and '
             f'{high}: set odometry.gray_range to the range of the camera'))
+
+    def masked(self, least: int = _IN_A_ROW) -> Complaint | None:
+        """Return the problem that masks exclude nearly all of at least so many images in a row."""
+        # Without a mask it is the distortion that leaves pixels unseen.
+        if self._masked_in_a_row < least or not (self._config.mask or self._config.mask_file):
+            return None
+        return Complaint('mask excludes the image', 'WARN', (
+            f'the mask (odometry.mask_file or topic mask) excludes {self._masked:.0%} of the '
+            f'image: pixels below {FREE} are excluded, so that one of 0 and 1 excludes all; make '
+            '255 what is to be used'))
 
     def _frame(self) -> Complaint | None:
         if self._last is None:

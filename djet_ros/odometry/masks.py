@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Gray level of a mask below which a pixel is ignored.
-_FREE = 128
+FREE = 128
 
 # Masks that are kept until their image comes.
 _KEPT = 50
@@ -21,7 +21,7 @@ _KEPT = 50
 
 def left_out(gray: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Return the ignored pixels (H, W) bool: True where a mask (H, W) is dark."""
-    return np.asarray(gray < _FREE)
+    return np.asarray(gray < FREE)
 
 
 class Masks:

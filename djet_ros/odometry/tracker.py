@@ -227,7 +227,7 @@ class Tracker:
             self.counts.rejected[problem.reason] += 1
             self.verdict = problem.reason
             return self._reject(problem, stamp)
-        self._health.image(prepared.few_levels)
+        self._health.image(prepared.few_levels, left_out)
         # A view that was prepared ahead is without the pixels that the camera does not see only.
         usable = left_out is self._camera.unseen(prepared.shape)
         return self._process(Frame(prepared.gray, self._camera.K, stamp, frame_of(message.header),
@@ -354,6 +354,12 @@ class Tracker:
                  self._health.never_measured(self._scale), self._health.two_cameras(),
                  *self._of_calibration, *self.complaints_of_inputs)
         return [one for one in found if one is not None]
+
+    @property
+    def masked(self) -> str:
+        """Return a text if a mask excludes nearly all of the newest image, or ''."""
+        found = self._health.masked(least=1)
+        return found.text if found else ''
 
     @property
     def complaints_of_inputs(self) -> list[Complaint]:

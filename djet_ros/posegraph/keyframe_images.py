@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, MutableMapping
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import NamedTuple
@@ -56,17 +55,16 @@ class KeyframeFile(MutableMapping[int, KeyframeImage], Closing):
             raise DjetError('the images of keyframes could not be written to a temporary file: '
                             f'{error.strerror}; free disk space, or select fewer keyframes '
                             '(--keyframes distance --keyframe-distance)') from error
-        nothing = np.empty((0, 0), np.uint8)
-        self._kept[number] = _Kept(offset, replace(frame, gray=nothing, left_out=None))
+        self._kept[number] = _Kept(offset, frame.stamp_ns, frame.frame_id)
 
     def __getitem__(self, number: int) -> KeyframeImage:
         """Read a keyframe."""
-        offset, frame = self._kept[number]
-        self._file.seek(offset)
+        kept = self._kept[number]
+        self._file.seek(kept.offset)
         gray, K, left_out, *features = (np.load(self._file, allow_pickle=False)
                                         for _ in range(3 + len(_FEATURES)))
-        return KeyframeImage(replace(frame, gray=gray, K=K,
-                                     left_out=left_out if left_out.size else None),
+        return KeyframeImage(Frame(gray, K, kept.stamp_ns, kept.frame_id,
+                                   left_out if left_out.size else None),
                              Features.with_descriptors(**dict(zip(_FEATURES, features))))
 
     def __contains__(self, number: object) -> bool:
@@ -91,7 +89,8 @@ class KeyframeFile(MutableMapping[int, KeyframeImage], Closing):
 
 
 class _Kept(NamedTuple):
-    """The file offset of a keyframe's arrays, and its frame without the image."""
+    """The file offset of a keyframe's arrays, and the stamp and the name of its frame."""
 
     offset: int
-    frame: Frame
+    stamp_ns: int
+    frame_id: str

@@ -19,11 +19,6 @@ from djet_ros.posegraph.units import rescaled_motion
 from djet_ros.recordings.recording import Recording
 import numpy as np
 
-# Parameters of section slam that apply offline; the others are for live use.
-PARAMETERS = tuple(f'slam.{name}' for name in (
-    'keyframes', 'keyframe_distance', 'keyframe_turn', 'links', 'length_noise', 'loop_gap',
-    'loop_votes', 'loop_candidates', 'loop_inliers', 'loop_share'))
-
 
 @dataclass(frozen=True)
 class Slam:

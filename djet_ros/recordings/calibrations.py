@@ -18,6 +18,9 @@ import numpy as np
 # Files beside the images: of numbers alone, and as the camera_calibration of ROS writes it.
 PLAIN, YAML = 'calibration.txt', 'calibration.yaml'
 
+# Numbers in the former: fx fy cx cy, with four or five coefficients of the distortion.
+_PLAIN_COUNTS = 4, 8, 9
+
 # Names of OpenCV's two distortion models in ASL and Kalibr files, and numbers of coefficients.
 _ASL_MODELS = {'radial-tangential': ('plumb_bob', (0, 4, 5)), 'radtan': ('plumb_bob', (4,)),
                'none': ('plumb_bob', (0,)), 'equidistant': ('equidistant', (4,))}
@@ -51,16 +54,26 @@ def camera_beside(folder: Path, size: tuple[int, int], published: Sequence[float
         return _of_yaml(ros, size)
     values = tuple(published)
     if plain.exists():
-        _, text = next(lines(plain), (0, ''))
-        try:
-            values = tuple(numbers(text))
-        except ValueError as error:
-            raise DjetError(f'{plain}: {error}') from error
-    if len(values) not in (4, 8, 9):
+        values = _of_text(plain)
+    if not values:
         raise DjetError(f"{folder} has no known camera; write 'fx fy cx cy', perhaps with "
                         f"'k1 k2 p1 p2 k3', into {plain}, or name a file of ROS's "
                         f'camera_calibration {YAML}')
     return Intrinsics(_matrix(values[:4], values[4:], plain), values[4:])
+
+
+def _of_text(path: Path) -> tuple[float, ...]:
+    """Return the numbers of a calibration.txt; more lines may be of another format."""
+    try:
+        rows = [numbers(text) for _, text in lines(path)]
+    except ValueError as error:
+        raise DjetError(f'{path}: {error}') from error
+    if len(rows) != 1 or len(rows[0]) not in _PLAIN_COUNTS:
+        where = 'one line' if len(rows) == 1 else f'{len(rows)} lines'
+        raise DjetError(f'{path} holds {sum(map(len, rows))} numbers in {where}; it must hold one '
+                        "line 'fx fy cx cy' in pixels, perhaps with 'k1 k2 p1 p2' or 'k1 k2 p1 p2 "
+                        "k3'")
+    return tuple(rows[0])
 
 
 def _of_yaml(path: Path, size: tuple[int, int]) -> Intrinsics:

@@ -117,7 +117,7 @@ class Replay:
         self._evaluate(summary)
         self._folder.finish(summary)
         return Outcome(summary, problem or None, (
-            *self._log.advice(), *self._of_late_info(), *self._of_truth(),
+            *self._log.advice(self._tracker.masked), *self._of_late_info(), *self._of_truth(),
             *(f'{one.name}: {one.text}' for one in self._tracker.complaints_of_content)))
 
     def _take(self, message: BagMessage) -> None:

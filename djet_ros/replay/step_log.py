@@ -55,9 +55,14 @@ class StepLog:
         return [(before.stamp_ns, after.stamp_ns) for before, after in pairwise(self.steps)
                 if after.status is Status.TIME_JUMP]
 
-    def advice(self) -> list[str]:
-        """Return warnings on gaps, on pairs that were not tracked, and on mixed units."""
-        return [*self._of_gaps(), *self._of_pairs(), *self._of_units()]
+    def advice(self, why_few: str = '') -> list[str]:
+        """
+        Return warnings on gaps, on pairs that were not tracked, and on mixed units.
+
+        why_few: why there are few matches, if it is known.
+        """
+        return [*self._of_gaps(), *self._of_pairs(why_few or _FEW_MATCHES_ADVICE),
+                *self._of_units()]
 
     def _of_gaps(self) -> list[str]:
         """Return a warning if gaps between images exceed odometry.max_gap."""
@@ -69,7 +74,7 @@ class StepLog:
                 f'{longest * 1e-9:.3f} s, ends at stamp {seconds_text(after)}; the trajectory '
                 'continues at the last pose, without the motion in the gap']
 
-    def _of_pairs(self) -> list[str]:
+    def _of_pairs(self, why_few: str) -> list[str]:
         """Return a warning if there is no pair, none was tracked, or none has a translation."""
         pairs = self.pairs()
         statuses = Counter(step.status for step in pairs)
@@ -85,8 +90,7 @@ class StepLog:
         if any(step.tracked for step in pairs):
             return []
         most = statuses.most_common(1)[0][0]
-        advice = (_FEW_MATCHES_ADVICE if most is Status.TOO_FEW_MATCHES
-                  else _NO_MOTION_ADVICE)
+        advice = why_few if most is Status.TOO_FEW_MATCHES else _NO_MOTION_ADVICE
         return [f'none of {len(pairs)} pairs could be tracked (mostly {most.value}): {advice}']
 
     def _of_units(self) -> list[str]:

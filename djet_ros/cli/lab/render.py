@@ -79,7 +79,7 @@ def _mems(args: argparse.Namespace) -> Mems:
 
 def _size(text: str) -> tuple[int, int]:
     """Return width and height of a text such as 620x188."""
-    match = re.fullmatch(r'(\d{1,5})x(\d{1,5})', text)
+    match = re.fullmatch(r'(\d{1,9})x(\d{1,9})', text)
     if match is None:
         raise argparse.ArgumentTypeError(f"'{text}' is not WIDTHxHEIGHT, such as 620x188")
     return int(match[1]), int(match[2])

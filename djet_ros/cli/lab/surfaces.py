@@ -74,6 +74,9 @@ def run(args: argparse.Namespace) -> int:
 def _images(args: argparse.Namespace) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Array]:
     """Return two images (H, W) and their camera matrix (3, 3)."""
     if args.other is None:
+        if args.camera is not None:
+            raise DjetError(f"--camera is '{args.camera}', but {args.source} has a calibration of "
+                            'its own; omit the option, or name two images')
         with TemporaryDirectory(prefix='djet-') as workspace:
             return pair_of_frames(args.source, args.pair, Path(workspace), warn)
     if args.camera is None:
