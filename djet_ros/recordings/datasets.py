@@ -170,7 +170,7 @@ def open_sequence(path: Path, own_poses: bool = True) -> FrameSequence:
         return plain_images(path)
     if not like_kitti and calibrated:
         raise DjetError(f'{path} has a calibration, but no image: PNG and JPEG are read '
-                        f'({", ".join(_SUFFIXES)}); convert others to PNG')
+                        f'({", ".join(IMAGE_SUFFIXES)}); convert others to PNG')
     if path.is_dir() and not like_kitti:
         raise DjetError(f'{path} is neither a bag nor a folder of KITTI (image_0, or raw: '
                         'image_00/data), TUM RGB-D (rgb.txt), 7-Scenes (frame-*.color.png), EuRoC '
