@@ -455,7 +455,8 @@ def speed(data: Path | None) -> dict[str, Any]:
         real = kitti(data)
         tum = [one for one in real_sequences(data) if (one / 'rgb.txt').exists()]
         folder = real[0] if real else render_sequence('road', Path(name), BENCH_PAIRS + 1)
-        bag = write_kitti_bag(KittiSequence(folder), Path(name) / 'bag')
+        bag = Path(name) / 'bag'
+        write_kitti_bag(KittiSequence(folder), bag)
         sources = {title(folder) if real else 'road': folder, 'the same from a bag': bag,
                    **{title(one): one for one in tum}}
         found = {of: bench(source, BENCH_PAIRS) for of, source in sources.items()}
