@@ -84,6 +84,7 @@ class TwoViewEstimator:
         """
         Prepare an undistorted gray image (H, W) uint8 with its camera matrix K (3, 3).
 
+        The view keeps the image itself, which must not change afterwards (a ``Frame`` has a copy).
         features: its features, if already detected in the image as prepared here; left_out: (H, W)
         bool mask of pixels to ignore. Raises ValueError if the image or K has the wrong shape or
         type.
