@@ -40,9 +40,10 @@ def djet(*arguments: object) -> CompletedProcess[str]:
 
 
 def record(square: float = 1.0, failed: bool = False, claims: tuple[float, float] = (0.1, 1.0),
-           status: Status = Status.OK, scene: str = 'road', stood: bool = False) -> Coverage:
-    return Coverage(scene, f'{scene}-1', 'alone', 4, 5, status.value, failed, 2.0, 20.0, *claims,
-                    square, 100, 90, stood)
+           status: Status = Status.OK, scene: str = 'road', stood: bool = False,
+           rotation: float = 0.2) -> Coverage:
+    return Coverage(scene, f'{scene}-1', 'alone', 4, 5, status.value, failed, rotation, 20.0,
+                    *claims, square, 100, 90, stood)
 
 
 def test_errors_drawn_from_the_covariance_lie_inside_as_often_as_claimed() -> None:
@@ -140,6 +141,16 @@ def test_a_motion_invented_of_a_standstill_is_wrong_and_sure() -> None:
     row, = coverage_rows([invented, humble, held, record(square=nan, claims=(0.1, 50.0))])
     assert (row.told, row.failed, row.given_up, row.needlessly, row.wrong_and_sure) == (
         0, 1, 1, 0, 1)
+
+
+@pytest.mark.parametrize('status', [Status.OK, Status.NO_PARALLAX])
+@pytest.mark.parametrize('stood', [False, True])
+def test_a_wrong_rotation_is_counted_where_no_direction_can_be_compared(
+        status: Status, stood: bool) -> None:
+    wrong, humble = (record(square=float('nan'), status=status, failed=True, stood=stood,
+                            rotation=5.0, claims=(claim, 50.0)) for claim in (0.01, 4.0))
+    row, = coverage_rows([wrong, humble])
+    assert (row.failed, row.untold, row.wrong_and_sure) == (2, 0, 1)
 
 
 def test_a_scene_without_motion_has_an_empty_plot_and_no_warning(tmp_path: Path) -> None:

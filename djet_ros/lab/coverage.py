@@ -20,7 +20,7 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import unit
 from djet_ros.core.types import Array, RelativePose, Status, TRACKED
-from djet_ros.lab.pairs import has_failed, PairChunk
+from djet_ros.lab.pairs import GROSS_ROTATION, has_failed, PairChunk
 from djet_ros.lab.runner import chunks_of
 from djet_ros.lab.scenes.sequence import rendered_scene
 from djet_ros.lab.sequences import Dataset, opened, plain_name
@@ -52,7 +52,7 @@ class Coverage:
     scene: without its seed; start: ALONE or IN_A_ROW; previous, current: indices of the frames;
     errors and standard deviations ('claim') in degrees, NaN if there is none; square: e^T C^-1 e;
     failed: see ``pairs.FAILURE``, of the best estimate if no pose was accepted; stood: whether the
-    camera did not move at all.
+    camera did not translate at all.
     """
 
     scene: str
@@ -77,13 +77,24 @@ class Coverage:
         return self.status == Status.OK.value and bool(np.isfinite(self.square))
 
     @property
+    def tracked(self) -> bool:
+        """Return whether a motion was accepted."""
+        return self.status in (s.value for s in TRACKED)
+
+    @property
+    def wrong_rotation(self) -> bool:
+        """Return whether a pair was tracked whose rotation failed, and alone can be compared."""
+        return (self.tracked and not self.has_nees and self.failed
+                and not self.rotation_error_deg <= GROSS_ROTATION)
+
+    @property
     def missed_direction(self) -> bool:
         """Return whether the pair was tracked without a direction, although the camera moved."""
-        return self.status in (s.value for s in TRACKED) and not self.has_nees and self.failed
+        return self.tracked and not self.has_nees and self.failed and not self.wrong_rotation
 
     @property
     def invented(self) -> bool:
-        """Return whether the pose has a direction of motion, although the camera stood still."""
+        """Return whether the pose has a direction of motion, although the camera had none."""
         return (self.stood and self.status == Status.OK.value
                 and self.direction_claim_deg < SURE_DIRECTION)
 
@@ -91,17 +102,17 @@ class Coverage:
     def overconfident(self) -> bool:
         """Return whether the pose failed with small standard deviations."""
         wrong = self.has_nees and self.failed and self.direction_claim_deg < SURE_DIRECTION
-        return (wrong or self.invented) and self.rotation_claim_deg < SURE_ROTATION
+        return ((wrong or self.invented or self.wrong_rotation)
+                and self.rotation_claim_deg < SURE_ROTATION)
 
     @property
     def rejected_correct(self) -> bool:
         """
         Return whether no pose was accepted, although the best estimate was correct.
 
-        That of a camera that stands still has no direction to be correct in.
+        That of a camera that does not translate has no direction to be correct in.
         """
-        return (self.status not in (s.value for s in TRACKED)
-                and not self.failed and not self.stood)
+        return not (self.tracked or self.failed or self.stood)
 
 
 @dataclass(frozen=True)
@@ -110,7 +121,7 @@ class CoverageRow:
     Summary of the pairs of one scene and start.
 
     told: pairs with a NEES; failed, wrong_and_sure: failed and overconfident ones among these and
-    among the ``Coverage.invented``; untold: tracked without a direction, see
+    among the ``Coverage.invented`` and ``wrong_rotation``; untold: tracked without a direction, see
     ``Coverage.missed_direction``; given_up: without a pose, needlessly: of these, with a correct
     best estimate; median: of the NEES, over the median of its distribution; inside: by LEVELS, the
     share of these pairs inside the ellipsoid, with its 95 % confidence interval (Clopper and
@@ -206,7 +217,7 @@ def _covered(dataset: Dataset, start: str, previous: int, current: int,
         pose.status.value, has_failed(rotation, direction, true_motion), rotation, direction,
         float(claims[0]), float(claims[1]),
         normalised_square(pose, true_motion) if np.isfinite(direction) else float('nan'),
-        len(pose.x), int(pose.inliers.sum()), bool(np.allclose(true_motion, np.eye(4))))
+        len(pose.x), int(pose.inliers.sum()), bool(np.allclose(true_motion[:3, 3], 0)))
 
 
 def _scene(dataset: Dataset) -> str:
@@ -236,12 +247,12 @@ def coverage_rows(records: Iterable[Coverage]) -> list[CoverageRow]:
 
 def _row(scene: str, start: str, records: Sequence[Coverage]) -> CoverageRow:
     squares = np.array([record.square for record in records if record.has_nees])
-    tracked = [status.value for status in TRACKED]
     return CoverageRow(
         scene, start, len(records), len(squares),
-        sum((record.failed and record.has_nees) or record.invented for record in records),
+        sum((record.failed and record.has_nees) or record.invented or record.wrong_rotation
+            for record in records),
         sum(record.missed_direction for record in records),
-        sum(record.status not in tracked for record in records),
+        sum(not record.tracked for record in records),
         sum(record.rejected_correct for record in records),
         sum(record.overconfident for record in records),
         float(np.median(squares) / chi2.median(5)) if len(squares) else float('nan'),
