@@ -15,7 +15,6 @@ import sys
 import textwrap
 from typing import Any
 
-from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.lab import peers
 from djet_ros.lab.ablation import ON_PLACES, WEIGHED
 from djet_ros.lab.chains import CHAINS
@@ -313,14 +312,17 @@ def peer_settings(_: Any) -> str:
         f'{TITLES[name]}: {first_line(chain.detect)} {first_line(chain.match)}')
         for name, chain in CHAINS.items())
     return (paragraph(
-        'Settings of the other methods are those that gave them the smallest errors. PL is '
-        f'PoseLib. RANSAC thresholds are {EstimatorConfig.ransac_threshold:g} px, as for our '
-        'initial pose. RANSAC and MAGSAC++ are `findEssentialMat` with a confidence of '
-        f'{peers.CONFIDENCE:g} and `recoverPose` with `distanceThresh={peers.FARTHEST:g}`: its '
-        'default ignores points beyond 50 baselines in the chirality check, which after a small '
-        'step of a hand-held camera is all of them. PoseLib is its LO-RANSAC and refinement with '
-        f'a Cauchy loss of scale {peers.LOSS_SCALE:g} px; its default, half the threshold, leaves '
-        'larger errors. The same holds with SIFT and KLT. `djet_ros/lab/chains.py` says what was '
+        'Settings of the other methods are fixed, and chosen for small errors over all scenes; '
+        'in single scenes others are better. PL is PoseLib. RANSAC and MAGSAC++ are '
+        f'`findEssentialMat` with a threshold of {peers.RANSAC_THRESHOLD:g} px, as our matches '
+        f'are accurate (the usual 1 px doubles the error), a confidence of {peers.CONFIDENCE:g}, '
+        f'and `recoverPose` with `distanceThresh={peers.FARTHEST:g}`: its default ignores points '
+        'beyond 50 baselines in the chirality check, which after a small step of a hand-held '
+        'camera is all of them. PoseLib is its LO-RANSAC with a threshold of '
+        f'{peers.POSELIB_THRESHOLD:g} px, at least {peers.MIN_ITERATIONS} iterations (its default '
+        'of 1000 takes six times as long for the same errors), and refinement with a Cauchy loss '
+        f'of scale {peers.LOSS_SCALE:g} px; its default, half the threshold, leaves larger '
+        'errors. The same holds with SIFT and KLT. `djet_ros/lab/chains.py` says what was '
         'tried.')
         + chains)
 
@@ -515,8 +517,9 @@ def speed(results: Any) -> str:
     growth = [(f'{name} {key}', f'{value:.1f}')
               for name, by in (('matches:', 'djet_ms_by_points'), ('window:', 'djet_ms_by_window'))
               for key, value in first[by].items()]
-    return (paragraph(f'{first["pairs"]} pairs, from recording to pose. Files are decoded; the '
-                      'bag holds raw images, as a camera driver sends them.')
+    bag = ('; the bag holds raw images, as a camera driver sends them' if len(sources) > 1
+           else '')
+    return (paragraph(f'{first["pairs"]} pairs, from recording to pose. Files are decoded{bag}.')
             + table(('', *columns), rows) + '\n'
             + paragraph('The D-JET stage (surfaces and optimisation), in ms, by number of matches '
                         f'and by window side. {kernel(first)}A frame in memory takes '

@@ -152,7 +152,7 @@ def test_the_same_images_give_the_same_pose_to_the_last_bit(name: str, street: S
 def test_points_many_baselines_away_distinguish_the_poses_of_opencv(name: str) -> None:
     # As a hand moves a camera by a centimetre, through a room of some metres.
     given = two_views(np.random.default_rng(0), t=FORWARD, near=60.0, far=300.0)
-    R, t, _ = ESTIMATORS[name](given.K, given.x, given.y, 1.0)
+    R, t, _ = ESTIMATORS[name](given.K, given.x, given.y)
     assert rotation_angle(R, given.R) < 1e-3
     assert direction_angle(t, given.t) < 0.1
 

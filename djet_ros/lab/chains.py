@@ -11,9 +11,11 @@ and medians over nine rendered scenes, and checked on real frames:
   thresholds of 0.5 or 1 px, weaker corners, and larger blocks make no difference overall, or are
   worse.
 * SIFT: ratios of 0.75 to 0.95 differ by a few per cent; lower contrast helps under water only.
-* PoseLib: a Cauchy loss of 0.25 px, instead of the default 0.5 px, reduces the error of both by a
-  seventh; 0.1 px improves sharp images further, but not blurred ones. Thresholds of 0.5 to 2 px,
-  the Huber and a truncated loss are no better overall.
+  With ``enable_precise_upscale`` keypoints are not shifted by a quarter of a pixel: directions of
+  forward drives are better by a tenth to a third, but rotations and other scenes worse.
+* PoseLib: a Cauchy loss of 0.1 px, instead of the default 0.5 px, reduces the error of both by a
+  fifth, most of all in sharp images; 0.25 px is better in blurred ones only. Thresholds of 0.5 to
+  2 px, the Huber and a truncated loss are no better overall.
 """
 
 from __future__ import annotations
@@ -35,7 +37,6 @@ _RATIO = 0.85
 _MIN_DISTANCE, _QUALITY = 8, 0.01
 _WINDOW, _LEVELS = 11, 5
 _MAX_ROUND_TRIP = 1.0
-_THRESHOLD = 1.0
 # Fewest matches for an estimate: more than the 5-point method needs for one hypothesis.
 _MIN_MATCHES = 8
 
@@ -61,7 +62,7 @@ class Chain:
         x, y = self.match(previous, current)
         if len(x) < _MIN_MATCHES:
             return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
-        return as_relative_pose(poselib(K, x, y, _THRESHOLD), K, x, y)
+        return as_relative_pose(poselib(K, x, y), K, x, y)
 
 
 def root_sift(gray: Image, mask: Mask | None = None) -> Points:

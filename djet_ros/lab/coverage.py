@@ -120,8 +120,8 @@ class CoverageRow:
     """
     Summary of the pairs of one scene and start.
 
-    told: pairs with a NEES; failed, wrong_and_sure: failed and overconfident ones among these and
-    among the ``Coverage.invented`` and ``wrong_rotation``; untold: tracked without a direction, see
+    told: pairs with a NEES; failed, wrong_and_sure: failed and overconfident ones among these, the
+    ``Coverage.invented`` and those of ``wrong_rotation``; untold: tracked without a direction, see
     ``Coverage.missed_direction``; given_up: without a pose, needlessly: of these, with a correct
     best estimate; median: of the NEES, over the median of its distribution; inside: by LEVELS, the
     share of these pairs inside the ellipsoid, with its 95 % confidence interval (Clopper and

@@ -30,8 +30,8 @@ class Method:
     to the preset, '' if there is none; good_start: whether to add the pose of RP-E, preset best,
     as an initial pose, and use only its inliers as matches; on_places: whether matches are first
     refined by D-JET's gray-level alignment, with the warps of its pose; weighed: whether they are
-    then weighted by the covariances of that alignment. Methods of other libraries take matches and
-    RANSAC threshold from config, except for complete pipelines (see chains), which do not use it.
+    then weighted by the covariances of that alignment. Methods of other libraries take the matches
+    of config, except for complete pipelines (see chains), which do not use it.
     """
 
     name: str

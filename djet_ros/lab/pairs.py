@@ -124,8 +124,7 @@ def estimate(method: Method, given: MethodInput) -> RelativePose:
     if method.on_places:
         given = _with_places(method, given)
     if method.name in peers.ESTIMATORS:
-        return peers.estimate(method.name, *given.views, given.x, given.y,
-                              config.ransac_threshold, config.min_matches)
+        return peers.estimate(method.name, given.views[1].K, given.x, given.y, config.min_matches)
     return TwoViewEstimator(config).estimate_matched(
         *given.views, given.x, given.y, given.start, covariances=given.covariances)
 
@@ -197,7 +196,18 @@ class _SharedWork:
         given = self.given(method)
         start = perf_counter()
         found = estimate(method, given)
-        return found, len(given.x), given.seconds + perf_counter() - start
+        seconds = given.seconds + perf_counter() - start
+        if method.name in peers.ESTIMATORS:
+            found = self._with_hamming(found)
+        return found, len(given.x), seconds
+
+    def _with_hamming(self, found: RelativePose) -> RelativePose:
+        """Add Hamming distances to a pose of others: for comparison only, and not timed."""
+        if found.status is not Status.OK:
+            return found
+        smoothed = [image.smoothed for image in self._images]
+        return replace(found, hamming=match_distances(smoothed[0], found.x, smoothed[1],
+                                                      found.y_opt))
 
     def _by_chain(self, method: str) -> tuple[RelativePose, float]:
         """Return the pose by a complete pipeline, which does not depend on the preset."""
@@ -206,12 +216,7 @@ class _SharedWork:
             start = perf_counter()
             found = CHAINS[method].estimate(previous, current, self._images[1].K)
             seconds += perf_counter() - start
-            if found.status is Status.OK:
-                # Hamming distances are for comparison only: not part of the method, nor timed.
-                smoothed = [image.smoothed for image in self._images]
-                found = replace(found, hamming=match_distances(smoothed[0], found.x, smoothed[1],
-                                                               found.y_opt))
-            self._chained[method] = found, seconds
+            self._chained[method] = self._with_hamming(found), seconds
         return self._chained[method]
 
     def given(self, method: Method) -> MethodInput:

@@ -114,7 +114,7 @@ class StepLog:
         Return the drift over the frames with a true pose (N, 4, 4), or None for a short path.
 
         With an unknown scale only the drift of the rotation is given. A relative scale is
-        multiplied by the factor that fits the whole path best.
+        multiplied by the ratio of the spreads of both paths.
         """
         known = np.isfinite(truth).all(axis=(1, 2))
         if not known.any():
