@@ -47,11 +47,13 @@ _ENABLED_BY = {'speed': 'odometry.scale to speed', 'imu': 'odometry.imu to true'
                'guess_frame',
                'mask': 'odometry.mask to true'}
 
-# The same for parameters that only some configurations use.
-_USED_WITH = {'odometry.scale_value': 'odometry.scale to constant',
-              'odometry.camera_height': 'odometry.scale to camera_height',
-              'odometry.camera_pitch': 'odometry.scale to camera_height',
-              'odometry.guess_frame': 'odometry.guess to true or odometry.scale to guess'}
+# The same for parameters that only some configurations use, and whether one does.
+_USED_WITH: dict[str, tuple[str, Callable[[OdometryConfig], bool]]] = {
+    'odometry.scale_value': ('odometry.scale to constant', lambda it: it.scale == 'constant'),
+    **dict.fromkeys(('odometry.camera_height', 'odometry.camera_pitch'), (
+        'odometry.scale to camera_height', lambda it: it.scale == 'camera_height')),
+    'odometry.guess_frame': ('odometry.guess to true or odometry.scale to guess',
+                             lambda it: it.guess_by_tf)}
 
 # Scale of a trajectory, as printed.
 _SCALES = {Scale.METRIC: 'metric', Scale.RELATIVE: 'relative, in units of the first step',
@@ -142,15 +144,11 @@ def check_topics(args: argparse.Namespace, wanted: Collection[str]) -> None:
 
 def _check_flags(args: argparse.Namespace, config: OdometryConfig) -> None:
     """Raise DjetError for a flag without effect; files are shared by several configurations."""
-    used = {'odometry.scale_value': config.scale == 'constant',
-            'odometry.camera_height': config.scale == 'camera_height',
-            'odometry.camera_pitch': config.scale == 'camera_height',
-            'odometry.guess_frame': config.guess_by_tf}
-    for name, value in flag_values(args).items():
+    given = flag_values(args)
+    for name, (setting, uses) in _USED_WITH.items():
         # Zero and '' take back what a file says.
-        if value and not used.get(name, True):
-            raise _unused(f'--{name.rpartition(".")[2].replace("_", "-")}', value,
-                          _USED_WITH[name])
+        if given.get(name) and not uses(config):
+            raise _unused(f'--{name.rpartition(".")[2].replace("_", "-")}', given[name], setting)
 
 
 def _unused(option: str, given: object, setting: str) -> DjetError:

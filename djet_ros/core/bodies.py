@@ -122,9 +122,7 @@ def are_of_one_motion(before: PreviousMotion | None, alone: RelativePose, by_all
     previous motion may be the wrong one.
     """
     one, other = Pose(alone.R, alone.t), Pose(by_all.R, by_all.t)
-    claimed = by_all.own_covariance_5
-    # Unknown if all together determine no motion.
-    if np.isfinite(claimed).all() and is_within(claimed, pose_difference(one.R, one.t, other)):
+    if is_within(by_all.own_covariance_5, pose_difference(one.R, one.t, other)):
         return True
     return before is not None and (
         continues_motion(before, other, one) or before.leaves_open(one, other))

@@ -283,8 +283,8 @@ def squared_distance(covariance: Array, offset: Array) -> float:
 
 
 def is_within(covariance: Array, offset: Array) -> bool:
-    """Return whether a difference of poses (5,) is within the 99.9 % ellipsoid."""
-    return squared_distance(covariance, offset) < CHI2_999
+    """Return whether a difference of poses (5,) is within the 99.9 % ellipsoid; no if unknown."""
+    return bool(np.isfinite(covariance).all()) and squared_distance(covariance, offset) < CHI2_999
 
 
 def widened_to_span(covariance: Array, offset: Array, probability: float) -> Array:

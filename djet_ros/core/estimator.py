@@ -197,9 +197,17 @@ class TwoViewEstimator:
         None if they do not determine one motion: also if that is a rotation alone, or if some of
         them turn out to be attached to the camera.
         """
-        result = self.estimate_pair(pair.of(followed))
-        found = result.status is Status.OK and len(result.x) == followed.sum()
-        return with_left_out(result, pair, followed) if found else None
+        result = self._estimate_part(pair, followed)
+        return result if result.status is Status.OK and len(result.x) == len(pair.x) else None
+
+    def _estimate_part(self, pair: Pair, kept: NDArray[np.bool_]) -> RelativePose:
+        """
+        Estimate the motion of some matches (N,) of a pair; the others are outliers of the result.
+
+        The result is without them if some of those kept are attached to the camera.
+        """
+        result = self.estimate_pair(pair.of(kept))
+        return with_left_out(result, pair, kept) if len(result.x) == kept.sum() else result
 
     def match(self, previous: View, current: View) -> Matches:
         """Match the features of two views: pixels x and y (N, 2), the most reliable first."""
@@ -230,13 +238,12 @@ class TwoViewEstimator:
         start: that motion, such as a rival that other evidence has decided for; known: as for
         ``estimate``.
         """
-        pair, kept = Pair(
+        pair = Pair(
             previous, current, relative.x, relative.y, PreviousMotion(start.R, start.t),
             known or KnownMotion(), start=start, sought=relative.sought,
-            timings=relative.timings), relative.of_body
-        result = self.estimate_pair(pair.of(kept))
-        whole = len(result.x) == kept.sum() < len(kept)
-        return with_left_out(result, pair, kept) if whole else result
+            timings=relative.timings)
+        kept = relative.of_body
+        return self.estimate_pair(pair) if kept.all() else self._estimate_part(pair, kept)
 
     def estimate_pair(self, pair: Pair) -> RelativePose:
         """Estimate the motion of a ``Pair``: its matches and all prior knowledge."""

@@ -84,7 +84,7 @@ class Coverage:
     @property
     def wrong_rotation(self) -> bool:
         """Return whether a pair was tracked whose rotation failed, and alone can be compared."""
-        return (self.tracked and not self.has_nees and self.failed
+        return (self.tracked and not self.has_nees
                 and not self.rotation_error_deg <= GROSS_ROTATION)
 
     @property

@@ -103,7 +103,9 @@ class Health:
         """
         self._few_levels = few_levels
         self._few_in_a_row = 0 if few_levels is None else self._few_in_a_row + 1
-        self._masked = 0.0 if left_out is None else np.count_nonzero(left_out) / left_out.size
+        # Without a mask it is the distortion that leaves pixels unseen.
+        masked = left_out if self._config.mask or self._config.mask_file else None
+        self._masked = 0.0 if masked is None else np.count_nonzero(masked) / masked.size
         self._masked_in_a_row = self._masked_in_a_row + 1 if self._masked > _MASKED else 0
 
     def processed(self, result: OdometryResult) -> None:
@@ -145,8 +147,7 @@ class Health:
 
     def masked(self, least: int = _IN_A_ROW) -> Complaint | None:
         """Return the problem that masks exclude nearly all of at least so many images in a row."""
-        # Without a mask it is the distortion that leaves pixels unseen.
-        if self._masked_in_a_row < least or not (self._config.mask or self._config.mask_file):
+        if self._masked_in_a_row < least:
             return None
         return Complaint('mask excludes the image', 'WARN', (
             f'the mask (odometry.mask_file or topic mask) excludes {self._masked:.0%} of the '

@@ -102,12 +102,8 @@ class EdgeFinder:
                 yield from self._link(current, previous, float(np.linalg.norm(motion[:3, 3])))
 
     def _link(self, current: int, previous: int, guess: float) -> Iterator[Edge]:
-        correction = self._correction(current)
-        view, other = self._view(previous, correction), self._view(current, correction)
-        if not of_same_camera(view, other):
-            return
-        relative = self._near.estimate(view, other)
-        if relative.status is Status.OK and self._is_verified(relative):
+        relative = self._estimated(self._near, previous, current, self._correction(current))
+        if relative and relative.status is Status.OK and self._is_verified(relative):
             yield _edge(previous, current, relative, unknown(guess), 'link')
 
     def loops(self, current: int, units: bool = False) -> Iterator[Edge]:
@@ -126,12 +122,8 @@ class EdgeFinder:
             yield from self._loop(current, place, units)
 
     def _loop(self, current: int, place: int, units: bool) -> Iterator[Edge]:
-        correction = self._correction(current)
-        view, other = self._view(current, correction), self._view(place, correction)
-        if not of_same_camera(view, other):
-            return
-        relative = self._wide.estimate(view, other)
-        if relative.status in TRACKED and self._is_verified(relative):
+        relative = self._estimated(self._wide, current, place, self._correction(current))
+        if relative and relative.status in TRACKED and self._is_verified(relative):
             length = self._length(current, relative)
             edge = _edge(current, place, relative, length, 'loop')
             yield edge if not units else replace(
@@ -153,7 +145,7 @@ class EdgeFinder:
             return None
         back = self._back(number, step.source, correction)
         length = float(np.linalg.norm(step.motion[:3, 3]))
-        return (back, length) if back is not None and back.status is Status.OK and length else None
+        return (back, length) if back and back.status is Status.OK and length else None
 
     def _back(self, number: int, neighbour: int, correction: Correction) -> RelativePose | None:
         """
@@ -163,13 +155,16 @@ class EdgeFinder:
         """
         if self._newest is not None and self._newest[0] == number:
             return self._newest[1]
-        view, other = self._view(number, correction), self._view(neighbour, correction)
-        if not of_same_camera(view, other):
-            return None
-        back = self._near.estimate(view, other)
-        if number == self._first + len(self._times) - 1:
+        back = self._estimated(self._near, number, neighbour, correction)
+        if back and number == self._first + len(self._times) - 1:
             self._newest = number, back
         return back
+
+    def _estimated(self, estimator: TwoViewEstimator, one: int, other: int,
+                   correction: Correction) -> RelativePose | None:
+        """Estimate the motion from one keyframe to another; None if they are of two cameras."""
+        views = self._view(one, correction), self._view(other, correction)
+        return estimator.estimate(*views) if of_same_camera(*views) else None
 
     def _length(self, current: int, relative: RelativePose) -> Length:
         """Return the length of a loop's translation, from points shared with the last edge."""

@@ -24,8 +24,6 @@ from djet_ros.lab.beside import (
 )
 from djet_ros.lab.methods import check_names
 from djet_ros.lab.pairs import FAILURE
-from djet_ros.lab.store import FILE_NAME
-from djet_ros.recordings.outputs import check_ours, make_folder
 import numpy as np
 from rich.table import Table
 
@@ -57,8 +55,6 @@ def run(args: argparse.Namespace) -> int:
     trials = split(args.trials)
     check_names('trial', trials, TRIALS)
     check_least(args, workers=1, frames=3)
-    check_ours(args.output, ('beside.json',), FILE_NAME)
-    make_folder(args.output)
     moments = _moments(args, [TrialChunk(name, seed, args.frames)
                               for name in trials for seed in args.seeds])
     rows = trial_rows(moments)

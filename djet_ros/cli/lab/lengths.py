@@ -13,8 +13,6 @@ from djet_ros.cli.terminal import compact_table, console
 from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import from_flat
 from djet_ros.lab.lengths import Drive, DriveChunk, run_drive, SEGMENTS_M
-from djet_ros.lab.store import FILE_NAME
-from djet_ros.recordings.outputs import check_ours, make_folder
 import numpy as np
 
 DESCRIPTION = """\
@@ -42,8 +40,6 @@ def run(args: argparse.Namespace) -> int:
     """Run all streets, and print drift and consistency."""
     check_least(args, workers=1, frames=3, hidden=0)
     size = (620, 188) if args.half else None
-    check_ours(args.output, ('lengths.json',), FILE_NAME)
-    make_folder(args.output)
     drives = _drives(args, [DriveChunk('road', seed, size, args.frames, args.hidden)
                             for seed in args.seeds])
     _show(drives)

@@ -60,6 +60,8 @@ def run_and_record(args: argparse.Namespace, kind: Callable[..., R], settings: M
                    results: Collection[str], chunks: Sequence[C], work: Callable[[C], list[R]]
                    ) -> list[R]:
     """Process all chunks on this machine, with a progress bar; results: see ``RecordStore``."""
+    check_ours(args.output, results, FILE_NAME)
+    make_folder(args.output)
     with (RecordStore(args.output, kind, settings, results, overwrite=args.overwrite) as store,
           local_workers(args.workers) as executor, progress_bar('pairs') as progress):
         return run(executor, chunks, work, store, progress)
