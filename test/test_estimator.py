@@ -744,6 +744,22 @@ def test_matches_may_be_integers_but_must_be_finite(method):
         estimator.estimate_matched(*views, x, x)
 
 
+@pytest.mark.parametrize(('x', 'y'), [((30, 2), (29, 2)), ((30, 3), (30, 3)), ((2,), (2,))])
+def test_matches_that_are_no_pairs_of_pixels_are_refused_with_their_shapes(x, y):
+    view = uniform_view()
+    with pytest.raises(ValueError, match=r'\(N, 2\) in pixels, got \(') as refused:
+        TwoViewEstimator().estimate_matched(view, view, np.zeros(x), np.zeros(y))
+    assert str(refused.value).endswith(f'got {x} and {y}')
+
+
+def test_a_pair_is_printed_in_a_line():
+    turned = Rotation.from_rotvec([0, np.radians(2), 0]).as_matrix()
+    pair = RelativePose(Status.OK, turned, np.array([0.0, 0.6, -0.8]), x=np.zeros((3, 2)),
+                        inliers=np.array([True, False, True]))
+    assert repr(pair) == ('RelativePose(OK, rotation 2.0000 deg, t [0.0, 0.6, -0.8], '
+                          '2 of 3 matches agree)')
+
+
 def test_planar_starts_include_the_motion_of_a_plane():
     rng = np.random.default_rng(58)
     x = rng.uniform((0, 0), SIZE, (200, 2))

@@ -145,6 +145,33 @@ def test_a_matrix_of_no_camera_is_refused_with_its_values(matrix, said):
         TwoViewEstimator(ESTIMATOR).view(image, matrix)
 
 
+def test_a_mask_of_another_size_is_refused():
+    image, mask = np.zeros((48, 64), np.uint8), np.ones((64, 48), bool)
+    with pytest.raises(ValueError, match=r'mask left_out is \(64, 48\), its image \(48, 64\)'):
+        Frame(image, K, 1, left_out=mask)
+    with pytest.raises(ValueError, match=r'mask left_out is \(64, 48\), its image \(48, 64\)'):
+        TwoViewEstimator(ESTIMATOR).view(image, K, left_out=mask)
+
+
+@pytest.mark.parametrize('stamp', [0.1, np.float64(1.7e9), None])
+def test_a_stamp_in_seconds_is_refused(stamp):
+    """Taken for nanoseconds, all images would be within one gap, and of one moment."""
+    with pytest.raises(ValueError, match=r'stamp_ns is .*whole nanoseconds'):
+        Frame(np.zeros((48, 64), np.uint8), K, stamp)
+
+
+def test_a_result_is_printed_in_a_line(cards):
+    vo = odometry()
+    first, second = (vo.process(Frame(cards.gray(pose(x=0.2 * i)), K, np.int64(i * 10**8)))
+                     for i in range(2))
+    assert repr(first) == ('OdometryResult(FIRST_FRAME, stamp_ns 0, position [0.0, 0.0, 0.0], '
+                           'scale unknown, None)')
+    x, *_ = second.pose[:3, 3].round(4).tolist()
+    agree, count = second.relative.inliers.sum(), len(second.relative.x)
+    assert f'OdometryResult(OK, stamp_ns 100000000, position [{x}, ' in repr(second)
+    assert f'{agree} of {count} matches agree))' in repr(second)
+
+
 def test_one_buffer_may_hold_all_images_in_turn(cards):
     """As cameras are read: the trajectory would be that of one image, without a word."""
     images = [cards.gray(pose(x=0.2 * i)) for i in range(3)]

@@ -86,10 +86,10 @@ class TwoViewEstimator:
 
         The view keeps the image itself, which must not change afterwards (a ``Frame`` has a copy).
         features: its features, if already detected in the image as prepared here; left_out: (H, W)
-        bool mask of pixels to ignore. Raises ValueError if the image or K has the wrong shape or
+        bool mask of pixels to ignore. Raises ValueError if one of them has the wrong shape or
         type.
         """
-        require_gray(gray, np.asarray(K))
+        require_gray(gray, np.asarray(K), left_out)
         K = self.correction.camera_matrix(K)
         gray, left_out = undistort_image(gray, K, self.correction.k1, left_out)
         mask = None if left_out is None else blocked(left_out)
@@ -221,10 +221,14 @@ class TwoViewEstimator:
 
         prior: as for ``estimate``; observe: called with each round of Algorithm 1; covariances:
         (N, 2, 2) of y up to a common factor, which weight the residuals of method rpe. Raises
-        ValueError if the views differ in size or camera matrix, or if matches are not finite.
+        ValueError if the views differ in size or camera matrix, or if matches are not finite or
+        not pairs of pixels.
         """
         _require_one_camera(previous, current)
         x, y = (np.asarray(places, np.float64) for places in (x, y))
+        if x.shape != y.shape or x.ndim != 2 or x.shape[1] != 2:
+            raise ValueError(f'expected matches x and y (N, 2) in pixels, got {x.shape} and '
+                             f'{y.shape}')
         if not (np.isfinite(x).all() and np.isfinite(y).all()):
             raise ValueError('matches must be finite; remove those that were not found')
         return self.estimate_pair(Pair(previous, current, x, y, _previous_motion(prior),

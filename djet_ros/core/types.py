@@ -111,13 +111,21 @@ def of_same_camera(one: Picture, other: Picture) -> bool:
     return one.gray.shape == other.gray.shape and np.array_equal(one.K, other.K)
 
 
-def require_gray(gray: NDArray[np.uint8], K: Array) -> None:
-    """Raise ValueError unless an image is (H, W) uint8, not empty, and K (3, 3) of a camera."""
+def require_gray(gray: NDArray[np.uint8], K: Array,
+                 left_out: NDArray[np.bool_] | None = None) -> None:
+    """
+    Raise ValueError unless an image is (H, W) uint8, not empty, and K (3, 3) of a camera.
+
+    left_out: mask of the image, which has to be of its size.
+    """
     if not isinstance(gray, np.ndarray) or gray.ndim != 2 or gray.dtype != np.uint8 \
             or not gray.size:
         got = (f'{gray.shape} {gray.dtype}' if isinstance(gray, np.ndarray)
                else type(gray).__name__)
         raise ValueError(f'expected a gray image (H, W) uint8, got {got}')
+    if left_out is not None and np.shape(left_out) != gray.shape:
+        raise ValueError(f'the mask left_out is {np.shape(left_out)}, its image {gray.shape}; '
+                         'give one of the same size')
     if K.shape != (3, 3):
         raise ValueError(f'expected the camera matrix K (3, 3), got {K.shape}')
     if not (np.isfinite(K).all() and min(K[0, 0], K[1, 1]) > 0
@@ -217,6 +225,13 @@ class RelativePose:
     own_covariance_5: Array = field(default_factory=lambda: np.full((5, 5), np.nan))
     sought: int = 0
     left_out: NDArray[np.bool_] | None = None
+
+    def __repr__(self) -> str:
+        """Sum up the pair in a line: its arrays would fill a screen."""
+        angle = 2 * np.arcsin(min(np.linalg.norm(self.R - np.eye(3)) / np.sqrt(8), 1.0))
+        return (f'RelativePose({self.status}, rotation {np.degrees(angle):.4f} deg, '
+                f't {self.t.round(4).tolist()}, '
+                f'{self.inliers.sum()} of {len(self.x)} matches agree)')
 
     @property
     def of_body(self) -> NDArray[np.bool_]:

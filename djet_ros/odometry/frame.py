@@ -19,7 +19,8 @@ class Frame:
     integers; stamp_ns: time of exposure in nanoseconds; frame_id: name of the camera's frame;
     left_out: (H, W) bool, mask of pixels to ignore, or None. The frame keeps copies of writeable
     arrays: one buffer may hold all images in turn. Raises ValueError for an image of another shape
-    or type or without pixels, and for a K that is no camera matrix.
+    or type or without pixels, a mask of another size, a K that is no camera matrix, and a stamp
+    that is no whole number, as of seconds.
     """
 
     gray: NDArray[np.uint8]
@@ -31,7 +32,10 @@ class Frame:
     def __post_init__(self) -> None:
         """Refuse what no view can be prepared of, before the odometry starts on it."""
         object.__setattr__(self, 'K', np.array(self.K, np.float64))
-        require_gray(self.gray, self.K)
+        require_gray(self.gray, self.K, self.left_out)
+        if not isinstance(self.stamp_ns, int | np.integer):
+            raise ValueError(f'stamp_ns is {self.stamp_ns!r}; give whole nanoseconds, such as '
+                             'round(seconds * 1e9)')
         # As the reference, the frame outlives many images; a copy takes 0.03 ms.
         for name in ('gray', 'left_out'):
             pixels = getattr(self, name)

@@ -78,6 +78,12 @@ class OdometryResult:
                    False, reference.since_ns, reference.since_covariance, length.metric,
                    length.measured, length.common, keyframe, correction)
 
+    def __repr__(self) -> str:
+        """Sum up the frame in a line: its arrays would fill a screen."""
+        return (f'OdometryResult({self.status}, stamp_ns {self.stamp_ns}, '
+                f'position {self.pose[:3, 3].round(4).tolist()}, scale {self.scale_kind}, '
+                f'{self.relative!r})')
+
     @property
     def scale_kind(self) -> Scale:
         """Return the unit of the translation's length."""
