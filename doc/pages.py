@@ -32,7 +32,6 @@ BLOCK = re.compile(r'(?<=<!-- generated: )([\w -]+)( -->\n).*?(?=<!-- end -->)',
 RESULTS = DOC / 'results.json'
 
 PRINTED_HAMMING = ('djet', 'rpe', 'five_point')
-STEPPED = 'tartanair indoor'
 OURS = ('djet', 'rpe', 'pjet', 'five_point')
 # Columns of the table in the README.
 SHOWN = ('djet', 'rpe', 'poselib', 'sift_poselib', 'klt_poselib')
@@ -331,16 +330,6 @@ def first_line(function: Callable[..., Any]) -> str:
     return str(function.__doc__).strip().split('\n')[0]
 
 
-def beyond(results: Any) -> str:
-    """Return how many pairs of STEPPED exceed the 99.9 % bound of their covariance."""
-    part = results['parts'].get(STEPPED)
-    if part is None:
-        return ''
-    one = part['odometry']['surprise']
-    return (f'  There, on {known_as(STEPPED)}, {one["beyond"]} of {one["pairs"]} pairs exceed the '
-            '99.9 % bound.\n')
-
-
 def odometry(results: Any) -> str:
     rows = []
     for name, part in sequences(results):
@@ -585,7 +574,7 @@ BLOCKS: dict[str, Callable[[Any], str]] = {
     'promises': promises, 'hard images': hard_images,
     'covariance bound': covariance_bound,
     'measured with': measured_with, 'compared': compared, 'table 1': table_1,
-    'peers': peer_settings, 'beyond': beyond,
+    'peers': peer_settings,
     'against rpe': against('rpe', ('best', 'paper')), 'against pjet': against('pjet', ('best',)),
     'odometry': odometry, 'drift': drift, 'lens': lens, 'surprise': surprise, 'closure': closure,
     'ablation': ablation, 'joined': joined, 'speed': speed,

@@ -17,7 +17,7 @@ from rich.table import Table
 
 DESCRIPTION = """\
 Render a road with exact ground truth (or take a KITTI sequence), convert it to a bag, replay the
-bag with D-JET and with reprojection error (RP-E), and compare their errors.
+bag with D-JET and with re-projection error (RP-E), and compare their errors.
 """
 
 METHODS = ('djet', 'rpe')

@@ -31,7 +31,7 @@ COMMANDS = {
     'export': 'write the pose graph of a replay for a SLAM back end',
     'lens': 'estimate the residual radial distortion of a calibrated camera',
     'kitti-to-bag': 'convert a KITTI odometry sequence to a rosbag2',
-    'demo': 'replay a sequence with D-JET and with reprojection error, and compare',
+    'demo': 'replay a sequence with D-JET and with re-projection error, and compare',
     'lab': 'evaluate and plot: errors, speed, memory, surfaces (djet lab --help)',
 }
 LAB = {

@@ -68,7 +68,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class AlgorithmTuning:
-    """Constants of Algorithm 1, each with its origin ("chosen" is an empirical value)."""
+    """Constants of Algorithm 1; "chosen" is by judgement or trial, not derived."""
 
     # loss scales; chosen: if most matches follow another motion, matches beyond this are removed,
     # where they have next to no weight anyway

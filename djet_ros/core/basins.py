@@ -45,7 +45,7 @@ MIN_SCALE = 0.02
 
 @dataclass(frozen=True)
 class BasinTuning:
-    """Constants of the choice, each with its origin ("chosen" is an empirical value)."""
+    """Constants of the choice; "chosen" is by judgement or trial, not derived."""
 
     # robust standard deviations; chosen: a second motion in the scene fits many matches loosely,
     # the camera's own fits most of them closely, so a loss with this scale tells basins apart

@@ -51,9 +51,10 @@ def detect_orb(gray: NDArray[np.uint8], max_features: int, fast_threshold: int =
 
 def match_everywhere(previous: Features, current: Features) -> NDArray[np.int64]:
     """
-    Match all features with all by Hamming distance, with cross-check, as in the paper.
+    Match all features with all by Hamming distance, with cross-check.
 
-    Returns (M, 2) indices into the previous and the current features, in the order of the former.
+    For the preset ``paper``; the paper does not say how it matches. Returns (M, 2) indices into
+    the previous and the current features, in the order of the former.
     """
     if not len(previous) or not len(current):
         return np.empty((0, 2), np.int64)

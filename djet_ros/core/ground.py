@@ -27,7 +27,7 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class GroundTuning:
-    """Constants of the ground, each with its source ("chosen" means not searched)."""
+    """Constants of the ground; "chosen" is by judgement or trial, not derived."""
 
     # Region of the ground, in heights of the camera over level ground; chosen for a car's lane:
     # least distance ahead, and to either side

@@ -1,8 +1,8 @@
 """
 Fusion of each match's minimum on its residual surface with its position by patch alignment.
 
-The sum of two residuals of the paper: the surface's, and the re-projection error. Both measure one
-position, with covariances S and T. For two Gaussians that is the position
+An addition to the paper. Both measure one position: the minimum y* with covariance S, and the
+aligned y with covariance T. For two Gaussians the sum of their residuals is the residual of
 
     y* - S (S + T)^-1 (y* - y)   with the covariance   S - S (S + T)^-1 S.
 """

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class JointTuning:
-    """Constants of the problem, each with its source ("chosen" means not searched)."""
+    """Constants of the problem; "chosen" is by judgement or trial, not derived."""
 
     # chosen: Gauss-Newton steps for each frame; four give the same result
     steps: int = 2

@@ -382,7 +382,7 @@ def resolve_indefinite(paraboloids: Paraboloids, policy: str) -> tuple[Paraboloi
     Apply the policy for indefinite surfaces; return the paraboloids and the number of these.
 
     policy: 'project' replaces them by the nearest positive definite ones, 'drop' marks them
-    unusable, 'keep' leaves them as in the paper.
+    unusable, 'keep' leaves them as they are.
     """
     is_indefinite = indefinite(paraboloids) & paraboloids.usable
     if policy == 'project':

@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class WindowTuning:
-    """Constants of the window, each with its source ("chosen" means not searched)."""
+    """Constants of the window; "chosen" is by judgement or trial, not derived."""
 
     # chosen for the cost: twice as many of either changed the drift on real streets only by noise
     keyframes: int = 6

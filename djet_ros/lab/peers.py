@@ -63,7 +63,7 @@ def estimate(name: str, K: Array, x: Array, y: Array, min_matches: int) -> Relat
     """
     Estimate the pose of matches x, y (N, 2) in pixels by the named method.
 
-    y_opt is the point of the epipolar line nearest to y, as with reprojection error.
+    y_opt is the point of the epipolar line nearest to y, as with re-projection error.
     """
     if len(x) < min_matches:
         return RelativePose(Status.TOO_FEW_MATCHES, x=x, y=y)
