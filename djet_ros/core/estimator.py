@@ -152,12 +152,12 @@ class TwoViewEstimator:
         """
         Estimate the motion of the body that the previous pair followed.
 
-        If another body moved there, its matches are left out: by now they may be the majority, or
-        fit a compromise of both motions. But all are used if they are of one motion, or if the
-        others alone fit worse than before and do not go on by the previous motion. (A body that
-        hides most of the world leaves few matches, and many of those are false.) If depths tell
-        that what was left out is the static world, the pair is estimated without regard to the one
-        before.
+        The matches of another body, if one moved there, are left out: by now they may be the
+        majority, or one pose may fit both bodies loosely. But all matches are used if they prove
+        to be of one motion, or if those that are kept neither fit as well as before nor continue
+        the previous motion: a body that hides most of the world leaves few matches, many of them
+        false. If depths tell that what was left out is the static world, the pair is estimated
+        without regard to the one before.
         """
         if prior is None:
             return self.estimate_pair(pair)

@@ -8,8 +8,9 @@ least value of the paraboloid on the line is
 
 so the summed loss of the paper is a least-squares problem with one residual per match: the
 distance of y* from its epipolar line, divided by its standard deviation under the covariance A'^-1
-(the Sampson distance with an anisotropic covariance). R is updated on SO(3) from the left, t on
-the unit sphere.
+(a Sampson distance for errors of y alone, which makes it exact). A robust loss acts on this
+residual, not on Q(y*), which does not depend on the pose. R is updated on SO(3) from the left, t
+on the unit sphere.
 """
 
 from __future__ import annotations

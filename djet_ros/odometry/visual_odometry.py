@@ -58,6 +58,11 @@ class VisualOdometry:
     """
     Estimates each frame's motion from a reference frame, and integrates the motions.
 
+    estimator, odometry: parameters, the defaults if None. Of the latter, max_gap, max_lost,
+    standstill, scale and what that needs have an effect here; the others concern messages
+    (`odometry.tracker`). scale: source of lengths in place of the one by the parameters, such as a
+    `SpeedScale`, which speeds are added to; gyro, guess: sources of rotations and of motions.
+
     The reference frame is the newest tracked frame, with four exceptions:
     * A bad pair keeps it, so that the next good pair bridges single bad frames. After max_lost bad
       pairs in a row each frame becomes the reference until a pair is good; the missing motion is
