@@ -18,7 +18,7 @@ from djet_ros.core.jet import (
     Residuals,
     Solution,
 )
-from djet_ros.core.paraboloid import median, quantile
+from djet_ros.core.medians import median, quantile
 from djet_ros.core.rivals import (
     preferences,
     PreviousMotion,

@@ -26,7 +26,8 @@ from typing import Any, NamedTuple
 from djet_ros import compiled
 from djet_ros.core.correction import displacements, OF_CAMERA
 from djet_ros.core.geometry import inverse_intrinsics, rays, rotation_exp, rotation_log
-from djet_ros.core.paraboloid import median, times
+from djet_ros.core.medians import median
+from djet_ros.core.paraboloid import times
 from djet_ros.core.radial import distort, distortion_jacobian, undistort
 from djet_ros.core.types import Array
 import numpy as np

@@ -18,8 +18,8 @@ from djet_ros import compiled
 from djet_ros.core.cells import in_few_bytes, rank_in_cells
 from djet_ros.core.hamming import dense_descriptors, describable, Image, Pixels, smooth
 from djet_ros.core.masks import Mask, masked_at
+from djet_ros.core.medians import quantile
 from djet_ros.core.orb_pattern import REACH
-from djet_ros.core.paraboloid import quantile
 from djet_ros.core.parallel import map_parallel
 from djet_ros.core.types import Features
 import numpy as np

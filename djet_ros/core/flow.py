@@ -12,7 +12,7 @@ from __future__ import annotations
 import cv2
 from djet_ros.core.geometry import norms
 from djet_ros.core.hamming import match_distances
-from djet_ros.core.paraboloid import median
+from djet_ros.core.medians import median
 from djet_ros.core.types import Array, View
 import numpy as np
 from numpy.typing import NDArray

@@ -26,7 +26,8 @@ from djet_ros.core.geometry import (
     skew,
     sphere_tangents,
 )
-from djet_ros.core.paraboloid import median, median_of_sorted, medians, Paraboloids
+from djet_ros.core.medians import median, median_of_sorted, medians
+from djet_ros.core.paraboloid import Paraboloids
 from djet_ros.core.types import Array, Pose
 import numpy as np
 from numpy.typing import NDArray

@@ -20,7 +20,7 @@ from djet_ros.core.jet import (
     ray_covariances,
     Solution,
 )
-from djet_ros.core.paraboloid import median, quantile
+from djet_ros.core.medians import median, quantile
 from djet_ros.core.patches import Aligned
 from djet_ros.core.types import Array
 import numpy as np

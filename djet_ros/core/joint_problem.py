@@ -28,7 +28,7 @@ from djet_ros.core.bundle import (
 from djet_ros.core.correction import motion_shift, OF_CAMERA
 from djet_ros.core.geometry import norms, skew, sphere_tangents
 from djet_ros.core.jet import LEAST_CURVATURE, Loss
-from djet_ros.core.paraboloid import median
+from djet_ros.core.medians import median
 from djet_ros.core.types import Array, RelativePose
 import numpy as np
 from numpy.typing import NDArray

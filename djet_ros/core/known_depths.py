@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from djet_ros.core.bundle import Landmarks, points_in_frame, Poses, projected
 from djet_ros.core.geometry import depths_in_second, inverse_depths, rays, sphere_tangents
-from djet_ros.core.paraboloid import median, weighted_median
+from djet_ros.core.medians import median, weighted_median
 from djet_ros.core.sketch import moved_all
 from djet_ros.core.types import Array, Pose, RelativePose
 import numpy as np

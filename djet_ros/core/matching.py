@@ -14,7 +14,7 @@ from djet_ros.core.features import match_everywhere, match_nearby
 from djet_ros.core.flow import flow_reach, NEAR_LEVELS, track_features
 from djet_ros.core.geometry import norms
 from djet_ros.core.hamming import match_distances
-from djet_ros.core.paraboloid import quantile
+from djet_ros.core.medians import quantile
 from djet_ros.core.prediction import (
     predict_at_infinity,
     predict_constant_motion,

@@ -26,13 +26,12 @@ from djet_ros.core.hamming import (
     warped_intensities,
 )
 from djet_ros.core.masks import masked_at
+from djet_ros.core.medians import median, medians_of_parts
 from djet_ros.core.orb_pattern import pattern
 from djet_ros.core.paraboloid import (
     fit_paraboloids,
     indefinite,
     largest,
-    median,
-    medians_of_parts,
     Paraboloids,
     project_to_positive,
     times,

@@ -13,7 +13,7 @@ from itertools import product
 from djet_ros.core.geometry import depths_in_second, inverse_depths, rays
 from djet_ros.core.jet import Loss, robust_scale
 from djet_ros.core.known_depths import same_points
-from djet_ros.core.paraboloid import weighted_median
+from djet_ros.core.medians import weighted_median
 from djet_ros.core.rivals import preferences, SIGNIFICANT_PREFERENCE
 from djet_ros.core.types import Array, Pose, RelativePose, Status
 import numpy as np

@@ -30,8 +30,8 @@ from djet_ros.core.geometry import (
 )
 from djet_ros.core.hamming import match_distances
 from djet_ros.core.jet import epipolar_residuals
+from djet_ros.core.medians import median, quantile
 from djet_ros.core.pair import Pair
-from djet_ros.core.paraboloid import median, quantile
 from djet_ros.core.patches import unaligned
 from djet_ros.core.rivals import (
     continues_motion,

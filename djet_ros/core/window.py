@@ -30,7 +30,7 @@ from djet_ros.core.jet import robust_scale
 from djet_ros.core.joint_problem import JointProblem
 from djet_ros.core.known_depths import KnownDepths, Lengths
 from djet_ros.core.landmark_choice import choose_landmarks
-from djet_ros.core.paraboloid import median
+from djet_ros.core.medians import median
 from djet_ros.core.radial import undistort_image
 from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.sighting import Sighting

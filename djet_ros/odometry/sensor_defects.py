@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import cv2
 from djet_ros.core.jet import robust_scale
-from djet_ros.core.paraboloid import medians
+from djet_ros.core.medians import medians
 from djet_ros.core.types import Array
 from djet_ros.odometry.images import Gray
 import numpy as np
