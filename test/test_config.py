@@ -10,7 +10,8 @@ from djet_ros.config.flags import add_flags, flag_values
 from djet_ros.config.flat import flat, from_flat, with_values
 from djet_ros.config.sections import Config, GRAPH_NAME, NODE_NAME, OdometryConfig, SECTIONS
 from djet_ros.config.yaml_files import dump_yaml, load_yaml, why_unused
-from djet_ros.core.estimator_config import preset
+from djet_ros.core.estimator_config import EstimatorConfig, preset
+from djet_ros.core.parameter import describe
 from djet_ros.errors import DjetError
 from djet_ros.live.parameters import FIXED_PARAMETERS, live_choices, tf_reason, with_live_values
 from djet_ros.odometry.images import BadMessage
@@ -63,6 +64,14 @@ def test_gray_range_may_have_a_comma():
 def test_every_parameter_has_a_description():
     for item in flat(Config()).values():
         assert len(item.description.text) > 10, item.name
+
+
+@pytest.mark.parametrize('config', [EstimatorConfig, OdometryConfig])
+def test_help_on_a_configuration_tells_what_each_parameter_means(config):
+    told = ' '.join(config.__doc__.split())
+    assert told.startswith('Parameters of the ')
+    for name, description in describe(config()).items():
+        assert f' {name}: {" ".join(description.explained.split())}' in told
 
 
 @pytest.mark.parametrize('as_comments', [False, True])

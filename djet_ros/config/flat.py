@@ -154,17 +154,6 @@ def shown(value: Any) -> str:
         return 'a huge number'
 
 
-def explain(item: FlatParameter) -> str:
-    """Return the description of a parameter with its choices or range."""
-    allowed = item.description
-    if allowed.choices:
-        return f'{allowed.text} [{" | ".join(allowed.choices)}]'
-    if allowed.minimum is not None:
-        odd = ', odd' if allowed.odd else ''
-        return f'{allowed.text} [{allowed.minimum} to {allowed.maximum}{odd}]'
-    return allowed.text
-
-
 def parse_value(item: FlatParameter, text: str) -> Value:
     """Parse a value of the parameter's type from a command line; DjetError if it is not one."""
     try:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import math
 
 from djet_ros.core.estimator_config import EstimatorConfig, PRESETS
-from djet_ros.core.parameter import check, parameter
+from djet_ros.core.parameter import check, documented, parameter
 
 NODE_NAME, GRAPH_NAME = 'vo_node', 'pose_graph_node'
 
@@ -22,6 +22,7 @@ def _words(numbers: str) -> list[str]:
     return numbers.strip().removeprefix('[').removesuffix(']').replace(',', ' ').split()
 
 
+@documented
 @dataclass(frozen=True)
 class OdometryConfig:
     """Parameters of the odometry. Raises ValueError on a value outside its described range."""

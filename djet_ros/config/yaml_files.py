@@ -10,7 +10,7 @@ import re
 import textwrap
 from typing import Any
 
-from djet_ros.config.flat import explain, flat, section, shown, Value, with_values
+from djet_ros.config.flat import flat, section, shown, Value, with_values
 from djet_ros.config.safe_files import read_yaml
 from djet_ros.config.sections import Config, GRAPH_NAME, NODE_NAME, SECTIONS
 from djet_ros.core.estimator_config import preset
@@ -170,7 +170,7 @@ def dump_yaml(config: Config, parts: Sequence[str] = ('', *SECTIONS), *,
         lines = [f'    {part}:'] if part else []
         indent = '      ' if part else '    '
         for item in section(config, part):
-            lines += textwrap.wrap(explain(item), 97, initial_indent=f'{indent}# ',
+            lines += textwrap.wrap(item.description.explained, 97, initial_indent=f'{indent}# ',
                                    subsequent_indent=f'{indent}# ')
             mark = '# ' if item.name in silent else ''
             name = item.name.rpartition('.')[2]

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from djet_ros.core.parameter import check, parameter
+from djet_ros.core.parameter import check, documented, parameter
 
 METHODS = ('djet', 'pjet', 'rpe', 'five_point')
 PRESETS = ('best', 'fast', 'paper')
 
 
+@documented
 @dataclass(frozen=True)
 class EstimatorConfig:
     """

@@ -1,14 +1,18 @@
 """
 Descriptions of the parameters of a configuration dataclass.
 
-All presentations of parameters (ROS declarations, YAML files, command-line flags) are derived from
-these, which are given once, next to the default.
+All presentations of parameters (ROS declarations, YAML files, command-line flags, ``help``) are
+derived from these, which are given once, next to the default.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Any
+from inspect import cleandoc
+from textwrap import fill
+from typing import Any, TypeVar
+
+Config = TypeVar('Config')
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,15 @@ class Description:
     odd: bool = False
     numbers: bool = False
 
+    @property
+    def explained(self) -> str:
+        """Return the text with the choices or the range."""
+        if self.choices:
+            return f'{self.text} [{" | ".join(self.choices)}]'
+        if self.minimum is not None:
+            return f'{self.text} [{self.minimum} to {self.maximum}{", odd" if self.odd else ""}]'
+        return self.text
+
 
 def parameter(default: Any, text: str, *, minimum: float | None = None,
               maximum: float | None = None, choices: tuple[str, ...] = (),
@@ -39,6 +52,14 @@ def describe(config: Any) -> dict[str, Description]:
     """Return the descriptions of the plain (not nested) parameters of a config, by name."""
     return {f.name: f.metadata['description'] for f in fields(config)
             if 'description' in f.metadata}
+
+
+def documented(config: type[Config]) -> type[Config]:
+    """Add the descriptions of its parameters to the docstring of a config, for ``help``."""
+    parameters = (fill(f'{name}: {description.explained}', 90, subsequent_indent='    ')
+                  for name, description in describe(config).items())
+    config.__doc__ = '\n'.join([cleandoc(config.__doc__ or ''), '', *parameters])
+    return config
 
 
 def check(config: Any) -> None:
