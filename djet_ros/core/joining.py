@@ -2,7 +2,7 @@
 Fusion of each match's minimum on its residual surface with its position by patch alignment.
 
 An addition to the paper. Both measure one position: the minimum y* with covariance S, and the
-aligned y with covariance T. For two Gaussians the sum of their residuals is the residual of
+aligned y with covariance T. The sum of their squared residuals is, up to a constant, that of
 
     y* - S (S + T)^-1 (y* - y)   with the covariance   S - S (S + T)^-1 S.
 """

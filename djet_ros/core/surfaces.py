@@ -401,7 +401,7 @@ def _without_pixel_locking(fitted: Paraboloids) -> Paraboloids:
     """
     Undo pixel locking: the bias of minima towards the pixel that the paraboloid is fitted around.
 
-    First-order inverse of d - k sin(2 pi d) / (2 pi), the estimate of a displacement d in pixels.
+    A displacement that is estimated as d pixels is taken to be d + k sin(2 pi d) / (2 pi).
     """
     drawn = _PIXEL_LOCKING / (2 * np.pi) * np.sin(2 * np.pi * fitted.minimum_offsets)
     return replace(fitted, b=fitted.b - times(fitted.A, drawn))
