@@ -478,6 +478,41 @@ def test_odometry_reset_continues_at_the_last_pose_until_a_loop_corrects_it(live
     assert after.max() < 0.1
 
 
+def test_after_a_loop_the_map_goes_on_in_the_unit_that_the_loop_has_corrected(live):
+    """An odometry whose unit of length grows by 3 % per frame, until it comes back."""
+    drive = Drive(live, drift=0.0)
+    result = drive.odometry._result
+    drive.odometry._result = lambda *args: replace(result(*args), metric=False)
+    move, unit_of_length = drive.odometry.move, 1.0
+
+    def move_in_its_unit(motion):
+        in_unit = motion.copy()
+        in_unit[:3, 3] /= unit_of_length
+        return move(in_unit, np.diag([(0.06 * 0.25)**2, *SIGMAS[1:]**2]))
+
+    drive.odometry.move = move_in_its_unit
+    drive.start()
+    for i in (*range(1, 9), *range(7, -1, -1)):
+        unit_of_length *= 1.03
+        drive.go(pose(x=0.25 * i))
+    optimisations, newest = drive.reported['optimisations'], drive.slam.map.keyframes[-1]
+    assert newest.factor > 1.3
+    # where there is no loop to find
+    drive.slam.map.search_loops = lambda: bool(drive.slam.map._pending.clear())
+    for i in range(1, 9):
+        drive.go(pose(x=-0.25 * i))
+    assert drive.reported['optimisations'] == optimisations
+    poses = dict(pose_of(one) for one in drive.path.poses)
+    gone = {stamp: np.linalg.norm(drive.by_odometry[stamp] - drive.by_odometry[newest.stamp_ns])
+            for stamp in poses if stamp > newest.stamp_ns}
+    assert max(gone.values()) > 1.0
+    for stamp, length in gone.items():
+        assert np.linalg.norm((poses[stamp] - newest.pose)[:3, 3]) == pytest.approx(
+            newest.factor * length)
+        if stamp in drive.corrections:
+            assert np.allclose(drive.corrections[stamp] @ drive.by_odometry[stamp], poses[stamp])
+
+
 def test_step_back_in_time_starts_a_new_map(live):
     drive = Drive(live)
     drive.start()

@@ -328,6 +328,20 @@ def test_votes_cover_all_keyframes(features):
     assert places.votes(features[3], 150)[64:].tolist() == ([*few] * 50)[64:]
 
 
+def test_a_pattern_that_repeats_itself_takes_little_memory():
+    """Then nearly all descriptors share their buckets: 500 for each of 30,000."""
+    rows, columns = np.mgrid[:376, :1241]
+    checks = ((rows // 20 + columns // 20) % 2 * 200 + 20).astype(np.uint8)
+    pattern = TwoViewEstimator().features(checks)
+    places = index(*[pattern] * 60)
+    tracemalloc.start()
+    votes = places.votes(pattern, 60)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert votes.tolist() == [500] * 60
+    assert peak < 100e6
+
+
 # Where keyframes are kept
 
 def test_keyframe_file_round_trip():

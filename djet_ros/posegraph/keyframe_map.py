@@ -167,6 +167,7 @@ class KeyframeMap:
         image: function from a stamp to its frame, or None if its image is missing. Such a frame
         cannot be a keyframe, and the next frame is tried.
         """
+        self._carry_on(step)
         offset = self._offset(step)
         self._metric = self._metric and (step.metric or not step.scale_known)
         frame = None
@@ -196,8 +197,25 @@ class KeyframeMap:
             return offset.is_far(self._slam)
         return step.keyframe
 
+    def _carry_on(self, step: Step) -> None:
+        """
+        Move the odometry's frame in the map, so that the pose of a step continues the last one.
+
+        After a reset of the odometry the best guess is the last pose. In a unit that loops have
+        corrected each motion is scaled, which a fixed transform between the frames cannot do.
+        """
+        before = self._newest_step
+        if before is None:
+            return
+        continues, factor = step.in_frame_of(before), self.keyframes[-1].factor
+        if continues and factor == 1.0:
+            return
+        motion = np.linalg.inv(before.pose) @ step.pose if continues else np.eye(4)
+        self.correction = (self.correction @ before.pose @ rescaled_motion(motion, factor)
+                           @ np.linalg.inv(step.pose))
+
     def _offset(self, step: Step) -> KeyframeOffset | None:
-        """Return the offset of a step's frame; after a reset of the odometry, move its frame."""
+        """Return the offset of a step's frame from its keyframe; None if it is the first."""
         if self.newest is None or self._newest_step is None:
             return None
         reference = self._offsets.get(step.previous_stamp_ns)
@@ -205,9 +223,6 @@ class KeyframeMap:
             return reference.then(step, self._slam, self._uncertainty)
         guess, covariance = unobserved_motion(self._newest_step, step)
         if not step.in_frame_of(self._newest_step):
-            # The best guess is the last pose.
-            self.correction = (self.correction @ self._newest_step.pose
-                               @ np.linalg.inv(step.pose))
             guess = np.eye(4)
         return self.newest.guessed(guess, covariance)
 

@@ -9,6 +9,7 @@ for the keyframes that have a similar descriptor.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 
 from djet_ros.core.types import Features
 import numpy as np
@@ -30,6 +31,10 @@ _MAX_DISTANCE = 40
 
 # Number of strongest features of a keyframe that are used.
 _MAX_FEATURES = 500
+
+# Pairs of descriptors that are compared at a time, in about 20 MB. A pattern that repeats itself
+# has millions, in the few buckets that its descriptors fill.
+_MOST_PAIRS = 1 << 18
 
 _ONES = np.array([bin(byte).count('1') for byte in range(256)], np.uint8)
 
@@ -92,24 +97,32 @@ class _Block:
 
     def votes(self, descriptors: NDArray[np.uint8]) -> Index:
         """Return how many of the descriptors (N, 32) have a similar one in each keyframe."""
-        queries, matches = self._bucket_mates(descriptors)
-        near = _ONES[descriptors[queries] ^ self._descriptors[matches]].sum(1) <= _MAX_DISTANCE
         # One vote per feature and keyframe, however many similar descriptors there are.
-        size = self.end - self.first
-        cast = np.unique(queries[near] * size + self._owner[matches[near]])
-        return np.bincount(cast % size, minlength=size)
+        voted = np.zeros((len(descriptors), self.end - self.first), bool)
+        for queries, matches in self._bucket_mates(descriptors):
+            undecided = ~voted[queries, self._owner[matches]]
+            queries, matches = queries[undecided], matches[undecided]
+            near = _ONES[descriptors[queries] ^ self._descriptors[matches]].sum(1) <= _MAX_DISTANCE
+            voted[queries[near], self._owner[matches[near]]] = True
+        return np.asarray(voted.sum(0))
 
-    def _bucket_mates(self, descriptors: NDArray[np.uint8]) -> tuple[Index, Index]:
-        """Return the index pairs of query and block descriptors that share a bucket."""
-        pairs = []
+    def _bucket_mates(self, descriptors: NDArray[np.uint8]) -> Iterator[tuple[Index, Index]]:
+        """Yield the index pairs of query and block descriptors that share a bucket, in parts."""
         for keys, (ordered, order) in zip(_keys(descriptors), self._tables):
             start = np.searchsorted(ordered, keys)
             size = np.searchsorted(ordered, keys, 'right') - start
-            within = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
-            pairs.append((np.repeat(np.arange(len(descriptors)), size),
-                          order[np.repeat(start, size) + within]))
-        queries, matches = (np.concatenate(part) for part in zip(*pairs))
-        return queries, matches
+            for part in _parts(size):
+                count = size[part]
+                within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+                yield (np.repeat(np.arange(part.start, part.stop), count),
+                       order[np.repeat(start[part], count) + within].astype(np.int64))
+
+
+def _parts(sizes: Index) -> Iterator[slice]:
+    """Return slices of the sizes (N,) with sums of about _MOST_PAIRS at most."""
+    part = (np.cumsum(sizes) - 1) // _MOST_PAIRS
+    edges = [0, *(np.flatnonzero(np.diff(part)) + 1), len(sizes)]
+    return (slice(*ends) for ends in pairwise(edges))
 
 
 def _keys(descriptors: NDArray[np.uint8]) -> Iterator[NDArray[np.uint16]]:
