@@ -550,6 +550,20 @@ def test_map_memory_is_bounded(live):
     assert after.max() < before.max()
 
 
+def test_only_images_whose_odometry_has_not_come_are_kept(live):
+    """Fifty colour images of a camera are a third of a gigabyte."""
+    drive = Drive(live, drift=0.0)
+    drive.start()
+    for i in range(1, 5):
+        drive.go(pose(x=0.01 * i))
+    assert not drive.slam._images
+    ahead = drive.odometry.stamp
+    for stamp in (ahead, ahead + PERIOD):
+        drive.slam.image(image(Cards().gray(REST), stamp_ns=stamp))
+    drive.go(pose(x=1.0))
+    assert [*drive.slam._images] == [ahead + PERIOD]
+
+
 @pytest.mark.parametrize(('source', 'target'), [(0, 2), (2, 0)])
 def test_edges_of_a_removed_keyframe_are_transferred_to_its_successor(live, source, target):
     """With the forgotten one held relative to its heir, an edge costs what it cost before."""

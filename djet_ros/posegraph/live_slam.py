@@ -244,6 +244,7 @@ class LiveSlam:
         for step in steps:
             self.problem = None
             self.map.extend(step, self._frame)
+            self._forget_images(step.stamp_ns)
             self._last = step
             # tf refuses a frame that is its own parent.
             if self.slam.publish_tf and self.map.keyframes \
@@ -271,6 +272,11 @@ class LiveSlam:
         except BadMessage as problem:
             self._reject('image', problem)
             return None
+
+    def _forget_images(self, until: int) -> None:
+        """Remove the images up to a stamp: keyframes are made of later ones only."""
+        for stamp in [one for one in self._images if one <= until]:
+            del self._images[stamp]
 
     def _path(self, last: Step) -> Outgoing:
         self._path_stamp = last.stamp_ns
