@@ -155,6 +155,7 @@ def test_number_lists_may_be_strings_or_lists(tmp_path, values):
     ('odometry.residual_k1', float('inf'), 'finite'),
     ('odometry.odom_frame', '', "^odometry.odom_frame is ''; name a frame"),
     ('odometry.odom_frame', '/', 'name a frame'),
+    ('slam.map_frame', '', "^slam.map_frame is ''; name a frame"),
     ('odometry.residual_k1', -1001.0, 'between'),
     ('odometry.max_gap', None, 'of type float'),
     ('ros.publish_tf', 1, 'of type bool'),

@@ -216,6 +216,8 @@ class SlamConfig:
         """Refuse values outside their described range."""
         check(self)
         _without_slashes(self, 'map_frame')
+        if not self.map_frame:
+            raise ValueError("map_frame is ''; name a frame")
 
 
 @dataclass(frozen=True)
