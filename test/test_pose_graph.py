@@ -218,6 +218,8 @@ def test_information_is_the_inverse_covariance_in_the_target_frame():
     (lambda C: -C, 'has the variance -'),
     (lambda C: C + np.triu(C, 1), 'is not symmetric'),
     (lambda C: np.ones((6, 6)), 'is singular'),
+    (lambda C: np.diag([1e-300, 1, 1, 1, 1, 1]), 'is singular'),
+    (lambda C: np.diag([1, 1, 1, 1e-17, 1, 1]), 'is singular'),
     (lambda C: np.eye(6) * 3 - 1, 'has a negative eigenvalue'),
     (lambda C: C[:5, :5], 'is not a finite 6x6 matrix')])
 def test_singular_covariance_is_refused_with_the_edge_name(

@@ -22,6 +22,10 @@ _UNIT = 1.0
 # Smallest eigenvalue of a correlation matrix that is not rounding.
 _SINGULAR = 1e-15
 
+# Variance along an axis, relative to that along another, which is lost in rounding when the axes
+# are rotated. It is 1e-15 for an unknown length with an exact direction.
+_LOST = 1e-16
+
 
 class Motion:
     """
@@ -159,10 +163,13 @@ def _fault(covariance: Array) -> str:
     variances = np.diag(covariance)
     if variances.min() <= 0:
         return f'has the variance {variances.min():.3g}'
-    correlation = covariance / np.sqrt(np.outer(variances, variances))
+    sigmas = np.sqrt(variances)
+    correlation = covariance / np.outer(sigmas, sigmas)
     if np.abs(correlation - correlation.T).max() > 1e-6:
         return 'is not symmetric'
     least = np.linalg.eigvalsh(correlation)[0]
     if least < -1e-9:
         return f'has a negative eigenvalue (correlations: {least:.3g})'
-    return '' if least > _SINGULAR else 'is singular'
+    halves = variances.reshape(2, 3)
+    regular = least > _SINGULAR and (halves.min(1) > _LOST * halves.max(1)).all()
+    return '' if regular else 'is singular'
