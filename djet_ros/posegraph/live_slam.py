@@ -244,7 +244,7 @@ class LiveSlam:
         for step in steps:
             self.problem = None
             self.map.extend(step, self._frame)
-            self._forget_images(step.stamp_ns)
+            self._forget_images(step)
             self._last = step
             # tf refuses a frame that is its own parent.
             if self.slam.publish_tf and self.map.keyframes \
@@ -273,9 +273,11 @@ class LiveSlam:
             self._reject('image', problem)
             return None
 
-    def _forget_images(self, until: int) -> None:
-        """Remove the images up to a stamp: keyframes are made of later ones only."""
-        for stamp in [one for one in self._images if one <= until]:
+    def _forget_images(self, step: Step) -> None:
+        """Remove the images since the last step: keyframes are made of later ones only."""
+        # After a step back in time, earlier ones may wait for the new map.
+        after = -np.inf if self._last is None else self._last.stamp_ns
+        for stamp in [one for one in self._images if after < one <= step.stamp_ns]:
             del self._images[stamp]
 
     def _path(self, last: Step) -> Outgoing:
