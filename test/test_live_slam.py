@@ -513,6 +513,31 @@ def test_after_a_loop_the_map_goes_on_in_the_unit_that_the_loop_has_corrected(li
             assert np.allclose(drive.corrections[stamp] @ drive.by_odometry[stamp], poses[stamp])
 
 
+@pytest.mark.parametrize(('first', 'unit_of_length'), [(0, 0.5), (7, 0.7)])
+def test_map_is_metric_once_lengths_are(live, first, unit_of_length):
+    """Before the first speed arrives, and after a gap, lengths are in another unit."""
+    drive = Drive(live, drift=0.0)
+    result, move, metric = drive.odometry._result, drive.odometry.move, True
+    drive.odometry._result = lambda *args: replace(result(*args), metric=metric)
+
+    def move_in_its_unit(motion):
+        in_unit = motion.copy()
+        in_unit[:3, 3] /= 1.0 if metric else unit_of_length
+        return move(in_unit, np.diag([(0.05 * in_unit[0, 3])**2 + 1e-8, *SIGMAS[1:]**2]))
+
+    drive.odometry.move = move_in_its_unit
+    drive.start()
+    for step, i in enumerate((*range(1, 9), *range(7, -1, -1))):
+        metric = not first <= step < first + 3
+        drive.go(pose(x=0.25 * i))
+    assert int(drive.reported['loops']) >= 3
+    places = {stamp: here[0, 3] for stamp, here in map(pose_of, drive.path.poses)}
+    for stamp, place in places.items():
+        assert place == pytest.approx(drive.true[stamp][0, 3], abs=0.1)
+    newest = drive.slam.map.keyframes[-1]
+    assert newest.factor == 1.0
+
+
 def test_step_back_in_time_starts_a_new_map(live):
     drive = Drive(live)
     drive.start()
@@ -560,8 +585,11 @@ def test_only_images_whose_odometry_has_not_come_are_kept(live):
     ahead = drive.odometry.stamp
     for stamp in (ahead, ahead + PERIOD):
         drive.slam.image(image(Cards().gray(REST), stamp_ns=stamp))
+    # and those of a bag that has started again
+    again = START - 10**9
+    drive.slam.image(image(Cards().gray(REST), stamp_ns=again))
     drive.go(pose(x=1.0))
-    assert [*drive.slam._images] == [ahead + PERIOD]
+    assert [*drive.slam._images] == [ahead + PERIOD, again]
 
 
 @pytest.mark.parametrize(('source', 'target'), [(0, 2), (2, 0)])

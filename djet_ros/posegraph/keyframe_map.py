@@ -31,7 +31,7 @@ class Keyframe:
     A keyframe of the map: its stamp and its current pose (4, 4) in the map.
 
     factor: scale factor from the odometry's unit of length at this keyframe to that of the map,
-    which is the unit at the very first keyframe.
+    which is the metre if any lengths are metric, else the unit at the very first keyframe.
     """
 
     stamp_ns: int
@@ -45,7 +45,8 @@ class KeyframeOffset(Motion):
     The pose of a frame in its keyframe, with covariance.
 
     keyframe: number of the keyframe; known: whether the whole motion from there was estimated,
-    otherwise it is a guess; uncorrelated: see ``Edge``.
+    otherwise it is a guess; uncorrelated: see ``Edge``; metric: whether all lengths since the
+    keyframe are in metres, None at the keyframe itself.
     """
 
     keyframe: int
@@ -54,6 +55,7 @@ class KeyframeOffset(Motion):
     scale_known: bool = True
     known: bool = True
     uncorrelated: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    metric: bool | None = None
 
     def then(self, step: Step, config: SlamConfig, uncertainty: float) -> KeyframeOffset:
         """
@@ -66,10 +68,13 @@ class KeyframeOffset(Motion):
         covariance = step.independent_covariance(uncertainty if step.metric else 0.0, noise)
         own = replace(step, covariance=covariance).length_noise(noise)
         R = self.motion[:3, :3]
+        # The first measured length changes the unit, and a sum of both units has no meaning.
+        same_unit = self.metric is not False or not step.metric
         return KeyframeOffset(self.keyframe, self.motion @ step.motion,
                               compose(self.motion, self.covariance, step.motion, covariance),
-                              self.scale_known and step.scale_known, self.known,
-                              self.uncorrelated + R @ own @ R.T)
+                              self.scale_known and step.scale_known and same_unit, self.known,
+                              self.uncorrelated + R @ own @ R.T,
+                              step.metric and self.metric is not False)
 
     def before(self, step: Step, config: SlamConfig, uncertainty: float) -> KeyframeOffset:
         """Return the offset of the frame before a keyframe, from the step to it."""
@@ -95,7 +100,8 @@ class KeyframeOffset(Motion):
         """Return the edge to the frame as keyframe number target."""
         return Edge(self.keyframe, target, self.motion, self.covariance,
                     'odometry' if self.known else 'unknown', self.scale_known,
-                    uncorrelated=self.uncorrelated)
+                    uncorrelated=self.uncorrelated,
+                    metric=self.scale_known and bool(self.metric))
 
 
 class _Pending(NamedTuple):

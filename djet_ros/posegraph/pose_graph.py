@@ -111,7 +111,8 @@ class Edge(Motion):
     more than one keyframe), 'loop' (of a revisited place) or 'unknown' (not estimated, with a
     large covariance); log_scale_ratio: of a loop, the logarithm of the unit of length at the
     target over that at the source, and its standard deviation, or None; uncorrelated: (3, 3) part
-    of the translation's covariance that is independent from pair to pair.
+    of the translation's covariance that is independent from pair to pair; metric: whether a known
+    length of the odometry is in metres.
     """
 
     source: int
@@ -122,6 +123,7 @@ class Edge(Motion):
     scale_known: bool = True
     log_scale_ratio: tuple[float, float] | None = None
     uncorrelated: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    metric: bool = False
 
     def inflated(self) -> Edge:
         """Return the edge with the covariance inflated for correlated errors of the odometry."""

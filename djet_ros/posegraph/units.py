@@ -7,7 +7,8 @@ logarithms of the units form a linear graph with one unknown per keyframe: conse
 have nearly the same unit, and a loop has a measured difference. This is the scale part of a Sim(3)
 pose graph (Strasdat et al., "Scale drift-aware large scale monocular SLAM", RSS 2010), solved
 first: all edges are then rescaled to the unit of the first keyframe, and poses are optimised in
-SE(3).
+SE(3). Where the odometry measures lengths, the unit is the metre: lengths from before the first
+measurement, or from after a gap, are brought to metres.
 """
 
 from __future__ import annotations
@@ -35,36 +36,46 @@ _LOSS_SCALE, _INITIAL_LOSS_SCALE = 3.0, 100.0
 
 def to_common_unit(graph: PoseGraph, first: float = 1.0) -> tuple[PoseGraph, Array]:
     """
-    Rescale all edges of a graph to a common unit, that at the first vertex divided by ``first``.
+    Rescale all edges of a graph to a common unit.
 
-    Returns (graph, factors (N,)): factors convert lengths in the unit at each vertex.
+    It is the metre if there are metric edges, else the unit at the first vertex divided by
+    ``first``. Returns (graph, factors (N,)): factors convert lengths in the unit at each vertex.
     """
-    factors = first * np.exp(log_units(len(graph.poses), graph.edges))
+    factors = np.exp(log_units(len(graph.poses), graph.edges))
+    if not any(edge.metric for edge in graph.edges):
+        factors *= first
     edges = tuple(rescaled_edge(edge, float(factors[edge.source])) for edge in graph.edges)
     return replace(graph, edges=edges), factors
 
 
 def log_units(count: int, edges: Sequence[Edge]) -> Array:
-    """Return the log units (N,) of the vertices relative to the first; 0 without such loops."""
+    """
+    Return the log units (N,) of the vertices; 0 without loops that measure their ratio.
+
+    They are relative to the metre if there are metric edges, else to the unit at the first vertex.
+    """
     loops = np.array([edge.log_scale_ratio is not None for edge in edges], bool)
-    if not loops.any():
+    metric = {end for edge in edges if edge.metric for end in (edge.source, edge.target)}
+    free = np.setdiff1d(np.arange(count), [*metric] or [0])
+    if not loops.any() or not len(free):
         return np.zeros(count)
     ends = np.array([(edge.source, edge.target) for edge in edges])
     # Links carry no information on units, and edges of unknown length hardly any.
     kept = loops | np.array([edge.kind in ('odometry', 'unknown') for edge in edges])
     difference = np.array([edge.log_scale_ratio[0] if edge.log_scale_ratio else 0.0
                            for edge in edges])
-    sigma = np.array([edge.log_scale_ratio[1] if edge.log_scale_ratio else _drift_sigma(edge)
+    sigma = np.array([edge.log_scale_ratio[1] if edge.log_scale_ratio
+                      else _drift_sigma(edge, measured=edge.target in metric)
                       for edge in edges])
     ends, loops, difference, sigma = (values[kept] for values in (ends, loops, difference, sigma))
     rows = np.repeat(np.arange(len(ends)), 2)
     J = coo_matrix((np.tile([-1.0, 1.0], len(ends)), (rows, ends.ravel())),
-                   shape=(len(ends), count)).tocsr()[:, 1:]
+                   shape=(len(ends), count)).tocsr()[:, free]
     weights = sigma**-2
     units = np.zeros(count)
     for loss_scale in np.geomspace(_INITIAL_LOSS_SCALE, _LOSS_SCALE, _ITERATIONS):
         robust = J.T.multiply(weights).tocsc()
-        units[1:] = spsolve(robust @ J, robust @ difference)
+        units[free] = spsolve(robust @ J, robust @ difference)
         off = (units[ends[:, 1]] - units[ends[:, 0]] - difference) / sigma
         _, trust = Loss('geman_mcclure', loss_scale * max(1.0, robust_scale(off[loops])))(off**2)
         weights = np.where(loops, trust, 1.0) / sigma**2
@@ -88,10 +99,15 @@ def rescaled_motion(motion: Array, factor: float) -> Array:
     return scaled_motion
 
 
-def _drift_sigma(edge: Edge) -> float:
-    """Return the standard deviation of the change of the log unit along an edge."""
+def _drift_sigma(edge: Edge, *, measured: bool) -> float:
+    """
+    Return the standard deviation of the change of the log unit along an edge.
+
+    measured: whether the unit at the target is the metre; the first measured length sets it.
+    """
     length = float(np.linalg.norm(edge.motion[:3, 3]))
-    if edge.kind != 'odometry' or not edge.scale_known or not length:
+    if (edge.kind != 'odometry' or not edge.scale_known or not length
+            or (measured and not edge.metric)):
         return 1.0
     along = edge.motion[:3, 3] / length
     share = np.sqrt(along @ edge.covariance[:3, :3] @ along) / length
