@@ -306,6 +306,17 @@ def test_pause_drops_and_counts_until_resume(live, drive):
     assert stamp_ns(one.graph.published('relative_pose')[-1].header) == 7 * PERIOD
 
 
+def test_latencies_are_those_of_processed_images(live, drive):
+    """One that is dropped, as during a pause, takes no time."""
+    one = live()
+    one.session.pause()
+    one.send(drive[:3])
+    one.wait_for_images(3)
+    one.session.resume()
+    said = one.graph.published('/diagnostics')[-1].status[0].values
+    assert not [value.key for value in said if 'latency' in value.key]
+
+
 def test_service_calls_are_answered_and_logged(live, drive):
     one = live()
     one.send(drive[:3])

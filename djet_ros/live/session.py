@@ -292,8 +292,10 @@ class Session:
         following = None if waiting is None else waiting.image
         if following is not None:
             tracker.prepare_ahead(following)
+        before = tracker.counts.processed
         self._publish(tracker.image(received.image, following))
-        self._latencies.add(received.at)
+        if tracker.counts.processed > before:
+            self._latencies.add(received.at)
         self._log_problem()
         for topic, make in (('debug_image', tracker.debug_image),
                             ('landmarks', tracker.landmarks)):
