@@ -538,6 +538,24 @@ def test_map_is_metric_once_lengths_are(live, first, unit_of_length):
     assert newest.factor == 1.0
 
 
+def test_length_of_an_edge_over_the_first_measured_length_is_unknown(live):
+    """It would be a sum of metres and of another unit; its direction is known as before."""
+    drive = Drive(live, drift=0.0)
+    result, metric = drive.odometry._result, False
+    drive.odometry._result = lambda *args: replace(result(*args), metric=metric)
+    drive.start()
+    drive.go(pose(x=0.2))
+    metric = True
+    drive.go(pose(x=0.6))
+    edge, = drive.slam.map.edges
+    assert not edge.scale_known
+    assert not edge.metric
+    assert np.sqrt(np.diag(edge.covariance)[:3]) == pytest.approx(
+        [0.6, 0.014, 0.014], rel=0.1)
+    drive.go(pose(x=1.2))
+    assert drive.slam.map.edges[1].metric
+
+
 def test_step_back_in_time_starts_a_new_map(live):
     drive = Drive(live)
     drive.start()

@@ -67,12 +67,14 @@ class KeyframeOffset(Motion):
         noise = config.length_noise if step.metric else 0.0
         covariance = step.independent_covariance(uncertainty if step.metric else 0.0, noise)
         own = replace(step, covariance=covariance).length_noise(noise)
-        R = self.motion[:3, :3]
+        R, motion = self.motion[:3, :3], self.motion @ step.motion
+        covariance = compose(self.motion, self.covariance, step.motion, covariance)
+        scale_known = self.scale_known and step.scale_known
         # The first measured length changes the unit, and a sum of both units has no meaning.
-        same_unit = self.metric is not False or not step.metric
-        return KeyframeOffset(self.keyframe, self.motion @ step.motion,
-                              compose(self.motion, self.covariance, step.motion, covariance),
-                              self.scale_known and step.scale_known and same_unit, self.known,
+        if scale_known and step.metric and self.metric is False:
+            translation = np.pad(motion[:3, 3], (0, 3))
+            covariance, scale_known = covariance + np.outer(translation, translation), False
+        return KeyframeOffset(self.keyframe, motion, covariance, scale_known, self.known,
                               self.uncorrelated + R @ own @ R.T,
                               step.metric and self.metric is not False)
 
