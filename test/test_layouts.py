@@ -8,12 +8,14 @@ from commands import checked
 import cv2
 from djet_ros.errors import DjetError
 from djet_ros.lab.scenes.sequence import render_sequence
-from djet_ros.odometry.messages import stamp_ns
+from djet_ros.odometry.camera import Camera
+from djet_ros.odometry.messages import seconds_text, stamp_ns
 from djet_ros.recordings.bag_writers import write_kitti_bag
 from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.datasets import euroc, open_sequence, seven_scenes, tum_rgbd
 from djet_ros.recordings.kitti_raw import clock_nanoseconds
 from djet_ros.recordings.recording import open_recording, RAW_IMAGE_TOPIC, SequenceRecording
+from djet_ros.replay.ground_truth import GroundTruth
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -178,6 +180,26 @@ def test_tum_vi_has_its_camera_from_kalibr_and_its_truth_from_mocap(asl: Path) -
         euroc(asl)
 
 
+@pytest.mark.parametrize(('resolution', 'reason'), [
+    ('[320, 240]', 'is of 320x240 pixels, the images have 160x120; calibrate at this size'),
+    (f'[{10**400}, 120]', 'is of 1000.{1,40}x120 pixels'),
+    ('160', "resolution.*: 'int' object"), ('[w, h]', 'resolution.*: invalid literal'),
+])
+@pytest.mark.parametrize('tool', ['asl', 'kalibr'])
+def test_a_calibration_for_images_of_another_size_is_refused(
+        asl: Path, tool: str, resolution: str, reason: str) -> None:
+    # As of images that were made smaller after the download.
+    file, text = asl / 'mav0' / 'cam0' / 'sensor.yaml', f'{OPENCV}resolution: [160, 120]\n'
+    if tool == 'kalibr':
+        file.unlink()
+        file, text = asl / 'mav0' / 'camchain.yaml', KALIBR
+    file.write_text(text)
+    assert euroc(asl).size == SIZE
+    file.write_text(text.replace('[160, 120]', resolution))
+    with pytest.raises(DjetError, match=f'{file} .*{reason}'):
+        euroc(asl)
+
+
 @pytest.mark.parametrize('sensor', ['cam0', 'imu0'])
 def test_a_number_too_large_for_any_mounting_is_an_error_of_one_line(
         asl: Path, sensor: str) -> None:
@@ -288,7 +310,27 @@ def test_own_images_are_in_the_order_of_their_numbers_with_the_camera_of_ros(ima
     assert (sequence.name, sequence.poses) == ('my_images', None)
     assert np.diff(sequence.stamps_ns).tolist() == [33_333_333] * 11
     (images / 'times.txt').write_text(''.join(f'{0.1 * i:.3f}\n' for i in range(12)))
-    assert np.diff(open_sequence(images).stamps_ns).tolist() == [100_000_000] * 11
+    assert open_sequence(images).stamps_ns.tolist() == [
+        (10_000 + i) * 100_000_000 for i in range(12)]
+
+
+def test_the_stamps_of_own_images_by_a_clock_are_kept(images: Path) -> None:
+    stamps = [1_403_636_579_763_555_584 + i * 50_000_001 for i in range(12)]
+    (images / 'times.txt').write_text(''.join(f'{seconds_text(stamp)}\n' for stamp in stamps))
+    assert open_sequence(images).stamps_ns.tolist() == stamps
+    # So ground truth with stamps is of the same clock.
+    truth = images / 'truth.txt'
+    truth.write_text(''.join(f'{seconds_text(stamp)} 0 0 0 0 0 0 1\n' for stamp in stamps))
+    with open_recording(images, poses=truth) as recording:
+        known, _ = GroundTruth.of(recording).known()
+    assert known.tolist() == stamps
+
+
+def test_a_byte_order_mark_of_an_editor_is_no_part_of_the_text(images: Path) -> None:
+    (images / 'calibration.yaml').unlink()
+    (images / 'calibration.txt').write_text('100 101 80 60\r\n', 'utf-8-sig')
+    (images / 'times.txt').write_text(''.join(f'{i}\r\n' for i in range(12)), 'utf-8-sig')
+    assert open_sequence(images).K.tolist() == [[100, 0, 80], [0, 101, 60], [0, 0, 1]]
 
 
 def test_a_calibration_by_opencv_and_one_of_many_coefficients_are_read(images: Path) -> None:
@@ -306,6 +348,23 @@ def test_a_calibration_by_opencv_and_one_of_many_coefficients_are_read(images: P
     assert sequence.model == 'rational_polynomial'
     assert sequence.distortion.tolist() == [0.1, -0.2, 0.001, 0.002, 0, 0.3, 0.1, 0]
     assert sequence.image(3).shape == SIZE[::-1]
+
+
+def test_a_fisheye_of_opencv_is_seen_as_such(images: Path) -> None:
+    D = np.array([[0.05], [-0.02], [0.01], [-0.003]])
+    file = cv2.FileStorage(str(images / 'calibration.yaml'), cv2.FILE_STORAGE_WRITE)
+    for name, value in zip(('image_width', 'image_height', 'fisheye_model'), (*SIZE, 1)):
+        file.write(name, value)
+    file.write('camera_matrix', np.array([[70, 0, 80], [0, 71, 60], [0, 0, 1.0]]))
+    file.write('distortion_coefficients', D)
+    file.release()
+    sequence = open_sequence(images)
+    assert sequence.model == 'equidistant'
+    ray = np.array([[0.5, -0.3]])
+    seen, _ = cv2.fisheye.projectPoints(np.append(ray, [[1.0]], 1)[None], np.zeros(3), np.zeros(3),
+                                        sequence.K, D)
+    camera = Camera(sequence.K, sequence.distortion, SIZE, sequence.model)
+    assert np.allclose(camera.pixels(ray, camera.k1)[0], seen[0])
 
 
 def test_the_four_numbers_of_a_camera_suffice(images: Path) -> None:

@@ -20,7 +20,7 @@ LARGEST_YAML = 2 << 20
 _LONGEST_INTEGER = 1000
 
 # The first line of OpenCV's files looks like a YAML directive but is not a valid one.
-_OPENCV_HEADER = re.compile(r'\A\ufeff?%YAML:\d[^\n]*')
+_OPENCV_HEADER = re.compile(r'\A%YAML:\d[^\n]*')
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]
@@ -39,7 +39,8 @@ def read_text(path: Path, largest: int = LARGEST_TEXT) -> str:
         if (size := path.stat().st_size) > largest:
             raise DjetError(f'{path} has {size} bytes, more than the limit of {largest}; '
                             'is it the right file?')
-        return path.read_text('utf-8')
+        # Editors of Windows put a byte order mark before the text.
+        return path.read_text('utf-8-sig')
     except OSError as error:
         raise DjetError(f'{path} could not be read: {error.strerror}') from error
     except UnicodeDecodeError as error:

@@ -81,14 +81,14 @@ def _of_yaml(path: Path, size: tuple[int, int]) -> Intrinsics:
     try:
         matrix = np.array(content['camera_matrix']['data'], dtype=np.float64).reshape(9)
         distortion = np.array(content['distortion_coefficients']['data'], np.float64).ravel()
-        model = str(content.get('distortion_model', 'plumb_bob'))
+        # OpenCV's sample does not name the model, but says whether it is that of a fisheye.
+        unnamed = 'equidistant' if content.get('fisheye_model') else 'plumb_bob'
+        model = str(content.get('distortion_model', unnamed))
         calibrated = int(content['image_width']), int(content['image_height'])
     except _UNFIT as error:
         raise DjetError(f'{path} is no calibration of ROS (camera_matrix, distortion_coefficients,'
                         f' image_width, image_height): {one_line(error)}') from error
-    if calibrated != size:
-        raise DjetError(f'{path} is of {calibrated[0]}x{calibrated[1]} pixels, the images have '
-                        f'{size[0]}x{size[1]}; calibrate at this size')
+    _check_size(path, calibrated, size)
     fx, skew, cx, *_, fy, cy = matrix[:6]
     if [skew, *matrix[[3, 6, 7, 8]]] != [0, 0, 0, 0, 1]:
         raise DjetError(f'{path}: camera_matrix is {one_line(matrix.tolist())}; it must be fx 0 '
@@ -102,16 +102,29 @@ def _of_yaml(path: Path, size: tuple[int, int]) -> Intrinsics:
                       model)
 
 
-def asl_camera(path: Path) -> tuple[Intrinsics, Array]:
-    """Return the camera of a sensor.yaml, and its pose (4, 4) in the body."""
+def _check_size(path: Path, calibrated: tuple[int, ...], size: tuple[int, int]) -> None:
+    """Raise DjetError if a calibration is of another size (width, height) than the images."""
+    if calibrated != size:
+        raise DjetError(f'{path} is of {one_line("x".join(map(str, calibrated)), 40)} pixels, the '
+                        f'images have {size[0]}x{size[1]}; calibrate at this size')
+
+
+def asl_camera(path: Path, size: tuple[int, int]) -> tuple[Intrinsics, Array]:
+    """
+    Return the camera of a sensor.yaml, and its pose (4, 4) in the body.
+
+    size: (width, height) of the images.
+    """
     sensor, camera_in_body = _asl_sensor(path)
     try:
         named = sensor.get('distortion_model', 'radial-tangential')
         intrinsics = [float(value) for value in sensor['intrinsics']]
         distortion = [float(value) for value in sensor.get('distortion_coefficients', [])]
+        calibrated = _resolution(sensor, size)
     except _UNFIT as error:
-        raise DjetError(f'{path} is no ASL camera description (intrinsics): '
+        raise DjetError(f'{path} is no ASL camera description (intrinsics, resolution): '
                         f'{one_line(error)}') from error
+    _check_size(path, calibrated, size)
     return _with_model(path, named, intrinsics, distortion), camera_in_body
 
 
@@ -135,7 +148,7 @@ def _asl_sensor(path: Path) -> tuple[dict[str, Any], Array]:
     return sensor, sensor_in_body
 
 
-def kalibr_camera(path: Path) -> tuple[Intrinsics, Array]:
+def kalibr_camera(path: Path, size: tuple[int, int]) -> tuple[Intrinsics, Array]:
     """Do the same for cam0 of a Kalibr camera chain, whose T_cam_imu is the inverse pose."""
     chain = read_yaml(path)
     try:
@@ -144,12 +157,19 @@ def kalibr_camera(path: Path) -> tuple[Intrinsics, Array]:
         intrinsics = [float(value) for value in camera['intrinsics']]
         distortion = [float(value) for value in camera['distortion_coeffs']]
         body_in_camera = _rigid(camera['T_cam_imu'])
+        calibrated = _resolution(camera, size)
     except _UNFIT as error:
-        raise DjetError(f'{path} is no Kalibr camera chain (cam0: intrinsics, T_cam_imu): '
-                        f'{one_line(error)}') from error
+        raise DjetError(f'{path} is no Kalibr camera chain (cam0: intrinsics, T_cam_imu, '
+                        f'resolution): {one_line(error)}') from error
+    _check_size(path, calibrated, size)
     check_rigid(body_in_camera[None], path)
     camera_in_body = np.asarray(np.linalg.inv(body_in_camera))
     return _with_model(path, named, intrinsics, distortion), camera_in_body
+
+
+def _resolution(camera: dict[str, Any], size: tuple[int, int]) -> tuple[int, ...]:
+    """Return the size of which the camera of a file is; that of the images if it has none."""
+    return tuple(int(side) for side in camera.get('resolution', size))
 
 
 def _rigid(values: object) -> Array:

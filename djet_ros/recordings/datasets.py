@@ -109,13 +109,16 @@ def plain_images(folder: Path) -> FrameSequence:
     Open a folder of images (PNG or JPEG) of one camera, and its calibration.
 
     The images are in the order of the numbers in their names. The camera is that of
-    ``camera_beside``. times.txt holds a stamp in seconds per image; without it the images are
-    taken to be at 30 Hz.
+    ``camera_beside``. times.txt holds a stamp in seconds per image, to which STAMP_OFFSET_NS is
+    added if they begin before it: a clock that ROS can use is kept. Without times.txt the images
+    are taken to be at 30 Hz.
     """
     paths = sorted(_images_in(folder), key=_by_numbers)
     images = ImageFiles(paths)
     camera, times = camera_beside(folder, images.size), folder / 'times.txt'
     stamps = read_times(times, len(paths)) if times.exists() else _usual_stamps(len(paths))
+    if stamps[0] < STAMP_OFFSET_NS:
+        stamps = stamps + STAMP_OFFSET_NS
     return FrameSequence(folder.resolve().name, images, camera.K, stamps, None,
                          camera.distortion, camera.model)
 
@@ -131,12 +134,13 @@ def euroc(folder: Path) -> FrameSequence:
     mav = folder / 'mav0' if (folder / 'mav0').is_dir() else folder
     camera = mav / 'cam0'
     stamps, paths = _listed_images(camera / 'data.csv', camera / 'data', whole_nanoseconds)
+    images = ImageFiles(paths)
     chain = next((path for path in (mav.parent / 'dso' / 'camchain.yaml', mav / 'camchain.yaml')
                   if path.exists()), None)
     if chain is not None and not (camera / 'sensor.yaml').exists():
-        lens, camera_in_body = kalibr_camera(chain)
+        lens, camera_in_body = kalibr_camera(chain, images.size)
     else:
-        lens, camera_in_body = asl_camera(camera / 'sensor.yaml')
+        lens, camera_in_body = asl_camera(camera / 'sensor.yaml', images.size)
     poses = None
     if (truth := mav / 'state_groundtruth_estimate0' / 'data.csv').exists():
         poses = from_first(poses_at(*_asl_states(truth, camera_in_body, 17), stamps,
@@ -144,7 +148,7 @@ def euroc(folder: Path) -> FrameSequence:
     elif (truth := mav / 'mocap0' / 'data.csv').exists():
         poses = from_first(poses_at(*_asl_states(truth, camera_in_body, 8), stamps,
                                     LONGEST_GAP_NS))
-    return FrameSequence(folder.resolve().name, ImageFiles(paths), lens.K, stamps, poses,
+    return FrameSequence(folder.resolve().name, images, lens.K, stamps, poses,
                          lens.distortion, lens.model, _asl_imu(mav / 'imu0', camera_in_body))
 
 

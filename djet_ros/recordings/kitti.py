@@ -46,7 +46,7 @@ class KittiSequence(FrameSequence):
         chosen = _frame_range(len(paths), start, end, self.folder)
         K = read_camera(self.folder / 'calib.txt')
         distortion = _distortion(self.folder / 'calib.txt')
-        stamps = read_times(self.folder / 'times.txt', len(paths))[chosen]
+        stamps = read_times(self.folder / 'times.txt', len(paths))[chosen] + STAMP_OFFSET_NS
         images = ImageFiles(paths[chosen])
         truth = None
         if own_poses and poses is None:
@@ -155,7 +155,7 @@ def read_times(path: Path, count: int) -> NDArray[np.int64]:
     """Return stamps in ns of a times.txt, seconds of each of `count` images; raise DjetError."""
     stamps, _ = stamped_rows(path, 1, nanoseconds)
     _check_length(path, len(stamps), count)
-    return increasing(stamps, path) + STAMP_OFFSET_NS
+    return increasing(stamps, path)
 
 
 def _poses_beside(folder: Path) -> Path | None:
