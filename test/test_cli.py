@@ -229,6 +229,13 @@ def test_a_reader_that_leaves_early_is_no_error(body: str) -> None:
     assert probe.wait(timeout=60) == 141
 
 
+def test_a_command_needs_no_stdout() -> None:
+    done = subprocess.run(['sh', '-c', '"$@" >&-', 'sh', sys.executable, '-c',
+                           PROBE.format(body="print('x')")], capture_output=True, text=True,
+                          timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, '')
+
+
 # Ends, unless a signal handler waits for the call that it interrupted.
 # By default a thread that waits for the interpreter waits for 5 ms, between any two signals.
 SIGNALS = """

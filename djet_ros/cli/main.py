@@ -93,7 +93,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _main(argv: Sequence[str] | None) -> int:
     try:
         code = run(sys.argv[1:] if argv is None else argv)
-        sys.stdout.flush()
+        # As print does, without a stdout do nothing.
+        print(end='', flush=True)
         return code
     except DjetError as error:
         return _fail(str(error))
