@@ -664,7 +664,8 @@ def test_names_from_a_bag_can_not_control_the_terminal(tmp_path):
 @pytest.mark.parametrize(('messages', 'problem'), [
     ([], 'holds no messages'),
     ([('/pose', pose(1), 1)], 'has no image topic, only /pose (geometry_msgs/msg/PoseStamped)'),
-    ([('/image', image(1), 1)], 'has no CameraInfo topic, only /image (sensor_msgs/msg/Image)'),
+    ([('/image', image(1), 1)], 'has no CameraInfo topic, only /image (sensor_msgs/msg/Image); '
+     'record it too, or put the images into a folder with their calibration.yaml'),
 ])
 @pytest.mark.parametrize('storage', STORAGES)
 def test_a_bag_without_a_camera_is_refused(tmp_path, storage, messages, problem):

@@ -1088,6 +1088,31 @@ def test_several_ground_truths_are_named_with_a_remedy(bag, tmp_path):
     assert answer.stderr.endswith(f"odometry.scale is 'ground_truth', but {both}")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize('child, warned', [('base_link', True), ('/camera', False), ('', False)])
+def test_a_ground_truth_that_is_not_of_the_camera_gives_a_warning(child, warned, tmp_path):
+    # As a simulator publishes it, of the vehicle.
+    kinds = {name: message_type(f'geometry_msgs/msg/{name}')
+             for name in ('TransformStamped', 'Transform', 'Vector3')}
+
+    def truth():
+        for i in range(FRAMES):
+            stamp = SECOND + i * SECOND // 10
+            stamped = MAKE.pose_in(stamp, 'world', np.linalg.matrix_power(STEP, i))
+            at = stamped.pose.position
+            yield '/ground_truth/state', kinds['TransformStamped'](
+                stamped.header, child, kinds['Transform'](
+                    kinds['Vector3'](at.x, at.y, at.z), stamped.pose.orientation)), stamp
+
+    bag = record(tmp_path / 'bag', [*truth(), *drive()])
+    printed = djet('replay', bag, '--output', tmp_path / 'r').stderr
+    assert printed == warned * (
+        "djet: warning: the ground truth on /ground_truth/state is of 'base_link', the images of "
+        "'camera': errors hold only if both have the same place and axes (x right, y down, z "
+        'ahead); give ground truth of the camera as a file (--poses)\n')
+    assert summary(tmp_path / 'r')['compared_pairs'] == FRAMES - 1
+
+
 def test_poses_are_read_from_every_kind_of_message():
     quaternion = message_type('geometry_msgs/msg/Quaternion')(x=0.0, y=0.0, z=1.0, w=0.0)
     point = message_type('geometry_msgs/msg/Point')(x=1.0, y=2.0, z=3.0)

@@ -78,8 +78,9 @@ def add_replay_options(parser: argparse.ArgumentParser, flags: Iterable[str]) ->
                         'override it, --preset all its estimator.* values')
     add_flags(parser, flags)
     parser.add_argument('--poses', type=Path, metavar='FILE',
-                        help="ground truth, in place of the recording's own: a TUM file, or a "
-                        'KITTI file with a row per image')
+                        help="ground truth, in place of the recording's own: poses of the camera "
+                        '(x right, y down, z ahead) as a TUM file, or a KITTI file with a row per '
+                        'image')
     add_topics(parser, 'image', 'info', *(what for what in AUXILIARY if what != 'tf'))
 
 

@@ -292,8 +292,10 @@ class BagRecording(Recording):
             return chosen[0]
         if not fitting:
             others = ', '.join(f'{topic.name} ({topic.msgtype})' for topic in self._topics[:12])
+            otherwise = ('' if types is IMAGE_TYPES else
+                         ', or put the images into a folder with their calibration.yaml')
             raise DjetError(f'{self.bag.path} has no {what} topic, only {one_line(others)}; '
-                            'record it too')
+                            f'record it too{otherwise}')
         choices = one_line(', '.join(
             f'{topic.name} ({topic.message_count})' for topic in fitting))
         if name is not None:

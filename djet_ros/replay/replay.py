@@ -85,6 +85,8 @@ class Replay:
         self._waiting: deque[BagMessage] = deque()
         self._following: BagMessage | None = None
         self._truth = GroundTruth()
+        # The frame that its newest message is the pose of, '' if it does not say.
+        self._frame_of_truth = ''
         # Recording time of the first image and of the first CameraInfo, by topic.
         self._first_ns: dict[str, int] = {}
         self._log = StepLog()
@@ -128,6 +130,7 @@ class Replay:
             self._waiting.append(message)
         elif message.topic == recording.ground_truth_topic:
             self._truth.add(*pose_of(message.message))
+            self._frame_of_truth = getattr(message.message, 'child_frame_id', '').lstrip('/')
         elif what == 'frames':
             self._frames.add(message.message)
             self._tracker.tf_static(message.message)
@@ -258,13 +261,14 @@ class Replay:
                 f'{self._time_of_first_info()}; record it before the images']
 
     def _of_truth(self) -> list[str]:
-        """Return a warning if there is ground truth, but at none of the images, or several."""
+        """Return a warning if ground truth is several, at no image, or of another frame."""
         images = self._log.stamps_ns
         if choices := self._recording.ground_truth_choices:
             return [f'no errors were computed: {_several(choices)}']
-        if not len(self._truth) or not images.size \
-                or np.isfinite(self._truth.at(images)).any():
+        if not len(self._truth) or not images.size:
             return []
+        if np.isfinite(self._truth.at(images)).any():
+            return self._of_frame_of_truth()
         name = self._recording.ground_truth_file or self._recording.ground_truth_topic
         known, _ = self._truth.known()
         if ((known[0] <= images) & (images <= known[-1])).any():
@@ -274,6 +278,15 @@ class Replay:
         ends = [seconds_text(stamp) for stamp in (*known[[0, -1]], images.min(), images.max())]
         return [f'no errors were computed: the stamps of {name} are {ends[0]} to {ends[1]}, those '
                 f'of the images {ends[2]} to {ends[3]}; give ground truth with the same clock']
+
+    def _of_frame_of_truth(self) -> list[str]:
+        """Return a warning if the ground truth is of another frame than the images."""
+        of, topic = self._frame_of_truth, self._recording.ground_truth_topic
+        frame = self._tracker.last.frame_id if self._tracker.last else ''
+        return [] if not of or not frame or of == frame else [
+            f"the ground truth on {topic} is of '{of}', the images of '{frame}': errors hold only "
+            'if both have the same place and axes (x right, y down, z ahead); give ground truth '
+            'of the camera as a file (--poses)']
 
     def _what(self) -> dict[str, Any]:
         """Return the entries of the summary that describe the input and the method."""
