@@ -794,7 +794,7 @@ def test_a_damaged_chunk_is_noticed_by_its_checksum(whole, tmp_path):
 
 @pytest.mark.parametrize(('content', 'problem'), [
     (b'', 'is empty (0 bytes)'),
-    (b'hello, this is no bag', "begins with b'hello, t'"),
+    (b'hello, this is no bag', "begins with b'hello, t'; name a bag, or a folder of images"),
     (b'#ROSBAG V1.2\n', 'ROS 1 bag (format 2.0)'),
     (b'#ROSBAG V2.0\n', 'cut short at byte'),
     (b'\x89MCAP0\r\n', 'cut short at byte 8'),

@@ -23,4 +23,4 @@ def open_storage(path: Path) -> Storage:
     if not start:
         raise BrokenFile('it is empty (0 bytes)')
     raise BrokenFile(f'it is no MCAP, rosbag2 sqlite3 or ROS 1 bag (format 2.0): it begins with '
-                     f'{start[:8]!r}')
+                     f'{start[:8]!r}; name a bag, or a folder of images, also for a video')
