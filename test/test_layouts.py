@@ -413,19 +413,21 @@ def test_images_without_a_calibration_are_told_what_they_need(images: Path) -> N
 
 
 @pytest.mark.parametrize(('text', 'holds'), [
-    ('100 101 80\n', '3 numbers in one line'),
-    ('100 101 80 60 0.1 0 0 0 0 0\n', '10 numbers in one line'),
-    ('100 101 80 60 640 480 0 0 0 0 0\n', '11 numbers in one line'),
-    ('100\n101\n80\n60\n', '4 numbers in 4 lines'),
-    ('100 0 80\n0 101 60\n0 0 1\n', '9 numbers in 3 lines'),
-    ('100 101 80 60\n0.1 0 0 0\n', '8 numbers in 2 lines'),
-    ('# fx fy cx cy\n', '0 numbers in 0 lines'),
+    ('100 101 80\n', ' holds 3 numbers in one line'),
+    ('100 101 80 60 0.1 0 0 0 0 0\n', ' holds 10 numbers in one line'),
+    ('100 101 80 60 640 480 0 0 0 0 0\n', ' holds 11 numbers in one line'),
+    ('100\n101\n80\n60\n', ' holds 4 numbers in 4 lines'),
+    ('100 0 80\n0 101 60\n0 0 1\n', ' holds 9 numbers in 3 lines'),
+    ('100 101 80 60\n0.1 0 0 0\n', ' holds 8 numbers in 2 lines'),
+    ('# fx fy cx cy\n', ' holds 0 numbers in 0 lines'),
+    # Of camera_calibration, next to its ost.yaml.
+    ('# oST version 5.0 parameters\n\n[image]\n\nwidth\n160\n', ": '.image.' is not a number"),
 ])
 def test_a_calibration_of_another_form_is_told_what_it_holds_and_must_hold(
         images: Path, text: str, holds: str) -> None:
     (images / 'calibration.yaml').unlink()
     (images / 'calibration.txt').write_text(text)
-    with pytest.raises(DjetError, match=f'calibration.txt holds {holds}; it must hold one line '
+    with pytest.raises(DjetError, match=f'calibration.txt{holds}; it must hold one line '
                                         "'fx fy cx cy' in pixels, perhaps with"):
         open_sequence(images)
 

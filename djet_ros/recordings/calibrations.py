@@ -64,15 +64,15 @@ def camera_beside(folder: Path, size: tuple[int, int], published: Sequence[float
 
 def _of_text(path: Path) -> tuple[float, ...]:
     """Return the numbers of a calibration.txt; more lines may be of another format."""
+    must = ("it must hold one line 'fx fy cx cy' in pixels, perhaps with 'k1 k2 p1 p2' or 'k1 k2 "
+            "p1 p2 k3'")
     try:
         rows = [numbers(text) for _, text in lines(path)]
     except ValueError as error:
-        raise DjetError(f'{path}: {error}') from error
+        raise DjetError(f'{path}: {error}; {must}') from error
     if len(rows) != 1 or len(rows[0]) not in _PLAIN_COUNTS:
         where = 'one line' if len(rows) == 1 else f'{len(rows)} lines'
-        raise DjetError(f'{path} holds {sum(map(len, rows))} numbers in {where}; it must hold one '
-                        "line 'fx fy cx cy' in pixels, perhaps with 'k1 k2 p1 p2' or 'k1 k2 p1 p2 "
-                        "k3'")
+        raise DjetError(f'{path} holds {sum(map(len, rows))} numbers in {where}; {must}')
     return tuple(rows[0])
 
 
