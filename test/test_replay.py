@@ -525,6 +525,18 @@ def test_only_results_are_overwritten_and_only_on_request(bag, replayed, tmp_pat
                                         expect=2).stderr
 
 
+def test_a_folder_to_which_another_replay_still_writes_is_refused(tmp_path):
+    results = tmp_path / 'results'
+    with ResultsFolder(results, Config()):
+        before = {path: path.read_bytes() for path in results.rglob('*') if path.is_file()}
+        with pytest.raises(DjetError, match='written to by another replay, which still runs'):
+            ResultsFolder(results, from_flat({'preset': 'fast'}), overwrite=True)
+        assert before == {
+            path: path.read_bytes() for path in results.rglob('*') if path.is_file()}
+    with ResultsFolder(results, from_flat({'preset': 'fast'}), overwrite=True):
+        assert load_yaml(results / 'config.yaml').preset == 'fast'
+
+
 @pytest.mark.parametrize('mistake', [
     ('absent',), ('bag', '--mask-file', 'absent.png'), ('bag', '--poses', 'absent.txt'),
     ('bag', '--scale', 'speed'), ('bag', '--preset', 'bset'), ('bag', '--imu-topic', '/imu')])

@@ -7,7 +7,8 @@ Nothing is replaced without ``overwrite``, and nothing that this package did not
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+import fcntl
 import os
 from pathlib import Path
 import shutil
@@ -94,6 +95,27 @@ class SetAside:
                 path.rename(self._folder / path.name)
             self._place.rmdir()
             self._place = None
+
+
+def lock(descriptor: int) -> None:
+    """Mark an open file as that of a running process, until it is closed or the process ends."""
+    # Some network file systems have no locks, and need none to be written to.
+    with suppress(OSError):
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def is_locked(path: Path) -> bool:
+    """Return whether a running process has locked a file, if there is one."""
+    if not path.is_file():
+        return False
+    with path.open('rb') as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False  # without locks, see above
+    return False
 
 
 def check_room(folder: Path, ours: Collection[str], overwrite: bool,

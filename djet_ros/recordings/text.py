@@ -44,6 +44,10 @@ class LineFile:
             raise
         return len(line)
 
+    def fileno(self) -> int:
+        """Return its descriptor."""
+        return self._file.fileno()
+
     def close(self) -> None:
         """Close the file."""
         self._file.close()

@@ -35,7 +35,7 @@ from djet_ros.odometry.tracker import Outgoing
 from djet_ros.posegraph.steps import Step
 from djet_ros.recordings.bag_writers import ResultBag
 from djet_ros.recordings.closing import Closing
-from djet_ros.recordings.outputs import replaced_whole, SetAside, write_whole
+from djet_ros.recordings.outputs import is_locked, lock, replaced_whole, SetAside, write_whole
 from djet_ros.recordings.point_clouds import PointFile
 from djet_ros.recordings.text import LineFile
 from djet_ros.recordings.trajectories import KittiWriter, TumWriter
@@ -48,7 +48,9 @@ PLOT = 'trajectory.png'
 BAG = 'bag'
 LANDMARKS = 'landmarks.ply'
 DEBUG = 'debug'
-_FILES = (SUMMARY, PLOT, LANDMARKS, 'trajectory_tum.txt', 'trajectory_kitti.txt', 'frames.csv',
+# Locked while the run goes on.
+_TABLE = 'frames.csv'
+_FILES = (SUMMARY, PLOT, LANDMARKS, 'trajectory_tum.txt', 'trajectory_kitti.txt', _TABLE,
           'errors.csv', 'config.yaml')
 # Of all that a replay writes into the folder.
 NAMES = (*_FILES, BAG, DEBUG)
@@ -67,7 +69,8 @@ class ResultsFolder(Closing):
 
     Until ``finish`` the summary marks the run as incomplete. Earlier results are set aside, and
     put back at the end if the new ones have no frame. Raises DjetError if the folder exists
-    (unless it is empty, or an earlier results folder and overwrite is set) or cannot be written.
+    (unless it is empty, or an earlier results folder and overwrite is set), cannot be written, or
+    is that of a replay that still runs.
     """
 
     def __init__(self, path: Path, config: Config, overwrite: bool = False) -> None:
@@ -75,6 +78,10 @@ class ResultsFolder(Closing):
         self.path = path
         present = path.exists()
         with self._beginning():
+            if is_locked(path / _TABLE):
+                # At its end it would write among the results of this one.
+                raise DjetError(f'{path} is written to by another replay, which still runs; end '
+                                'it, or choose another --output')
             self._earlier = SetAside(path, NAMES, overwrite, marks=(SUMMARY, 'config.yaml'))
         try:
             with self._beginning():
@@ -87,7 +94,8 @@ class ResultsFolder(Closing):
 
     def _begin(self, config: Config) -> None:
         write_whole(self.path / 'config.yaml', dump_yaml(config))
-        self._table = LineFile(self.path / 'frames.csv')
+        self._table = LineFile(self.path / _TABLE)
+        lock(self._table.fileno())
         self._summarise(UNFINISHED)
         self._rows = csv.writer(self._table, lineterminator='\n')
         self._rows.writerow(COLUMNS)
