@@ -466,7 +466,7 @@ T_BS:
   cols: 4
   rows: 4
   data: [0.0, -1.0, 0.0, -0.02, 1.0, 0.0, 0.0, -0.06, 0.0, 0.0, 1.0, 0.01, 0.0, 0.0, 0.0, 1.0]
-resolution: [64, 48]
+resolution: [24, 20]
 intrinsics: [60, 60, 31.5, 23.5] #fu, fv, cu, cv
 distortion_model: radial-tangential
 distortion_coefficients: [-0.28, 0.07, 0.0002, 1.8e-05]
@@ -515,7 +515,8 @@ def tum_vi_folder(place: Path) -> None:
         'cam0:\n  T_cam_imu:\n  - [0.0, -1.0, 0.0, -0.02]\n  - [1.0, 0.0, 0.0, -0.06]\n'
         '  - [0.0, 0.0, 1.0, 0.01]\n  - [0.0, 0.0, 0.0, 1.0]\n  camera_model: pinhole\n'
         '  distortion_coeffs: [0.0034, 0.0007, -0.002, 0.0002]\n'
-        '  distortion_model: equidistant\n  intrinsics: [60.0, 60.5, 31.0, 23.0]\n')
+        '  distortion_model: equidistant\n  intrinsics: [60.0, 60.5, 31.0, 23.0]\n'
+        '  resolution: [24, 20]\n')
 
 
 def kitti_with_imu(place: Path) -> None:
@@ -527,8 +528,8 @@ def kitti_with_imu(place: Path) -> None:
 
 
 def seven_scenes_folder(place: Path) -> None:
-    # Its camera is known, and none of pictures that are much smaller.
-    picture = cv2.imencode('.png', NOISE)[1].tobytes()
+    # Its camera is known, of pictures of this size.
+    picture = cv2.imencode('.png', cv2.resize(NOISE, (640, 480)))[1].tobytes()
     for i in range(FRAMES):
         (place / f'frame-{i:06d}.color.png').write_bytes(picture)
         (place / f'frame-{i:06d}.pose.txt').write_text(

@@ -74,7 +74,7 @@ def tum(tmp_path):
     (folder / 'rgb').mkdir(parents=True)
     stamps = [f'{1341846313 + i // 30}.{i % 30 * 33333 + 500:06d}' for i in range(40)]
     for stamp in stamps:
-        cv2.imwrite(str(folder / 'rgb' / f'{stamp}.png'), np.zeros((120, 160, 3), np.uint8))
+        cv2.imwrite(str(folder / 'rgb' / f'{stamp}.png'), np.zeros((480, 640, 3), np.uint8))
     (folder / 'rgb.txt').write_text('# color images\n# timestamp filename\n' + ''.join(
         f'{stamp} rgb/{stamp}.png\n' for stamp in stamps))
     lines = []

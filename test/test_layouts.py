@@ -238,10 +238,10 @@ def test_jpeg_images_are_read_where_png_are(tmp_path: Path) -> None:
         tum_rgbd(folder)
 
 
-def seven_scenes_folder(folder: Path, suffix: str) -> Path:
+def seven_scenes_folder(folder: Path, suffix: str, size: tuple[int, int] = (640, 480)) -> Path:
     folder.mkdir()
     for i in range(3):
-        cv2.imwrite(str(folder / f'frame-{i:06d}.color.{suffix}'), NOISE)
+        cv2.imwrite(str(folder / f'frame-{i:06d}.color.{suffix}'), cv2.resize(NOISE, size))
         pose = np.eye(4)
         pose[:3, 3] = 2 + 0.1 * i, 1, 0
         np.savetxt(folder / f'frame-{i:06d}.pose.txt', pose)
@@ -255,6 +255,15 @@ def test_7_scenes_is_read_as_published(tmp_path: Path, suffix: str) -> None:
     assert sequence.poses is not None
     assert np.allclose(sequence.poses[:, :3, 3], [[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]])
     assert np.diff(sequence.stamps_ns).tolist() == [33_333_333] * 2
+
+
+def test_a_published_camera_is_not_that_of_images_of_another_size(tmp_path: Path) -> None:
+    folder = seven_scenes_folder(tmp_path / 'seq-01', 'png', (320, 240))
+    with pytest.raises(DjetError, match='published camera is of 640x480 pixels, the images have '
+                       "320x240; write 'fx fy cx cy' of these into .*calibration.txt"):
+        open_sequence(folder)
+    (folder / 'calibration.txt').write_text('292.5 292.5 160 120')
+    assert open_sequence(folder).K[0, 0] == 292.5
 
 
 def test_a_pose_of_7_scenes_that_is_none_is_named(tmp_path: Path) -> None:

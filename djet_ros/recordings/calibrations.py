@@ -21,6 +21,9 @@ PLAIN, YAML = 'calibration.txt', 'calibration.yaml'
 # Numbers in the former: fx fy cx cy, with four or five coefficients of the distortion.
 _PLAIN_COUNTS = 4, 8, 9
 
+# Size (width, height) of the images that the published cameras of data sets are of.
+_PUBLISHED_SIZE = 640, 480
+
 # Names of OpenCV's two distortion models in ASL and Kalibr files, and numbers of coefficients.
 _ASL_MODELS = {'radial-tangential': ('plumb_bob', (0, 4, 5)), 'radtan': ('plumb_bob', (4,)),
                'none': ('plumb_bob', (0,)), 'equidistant': ('equidistant', (4,))}
@@ -43,8 +46,9 @@ def camera_beside(folder: Path, size: tuple[int, int], published: Sequence[float
     Return the camera of calibration.txt or calibration.yaml in a folder of images.
 
     The text is "fx fy cx cy [k1 k2 p1 p2 [k3]]", and so is `published`, which holds without any
-    file. The YAML is that of ROS's camera_calibration, or of OpenCV. size: (width, height) of the
-    images. Raises DjetError if there is no camera, or an invalid one.
+    file, for images of _PUBLISHED_SIZE. The YAML is that of ROS's camera_calibration, or of
+    OpenCV. size: (width, height) of the images. Raises DjetError if there is no camera, or an
+    invalid one.
     """
     plain, ros = folder / PLAIN, folder / YAML
     if ros.exists():
@@ -52,9 +56,11 @@ def camera_beside(folder: Path, size: tuple[int, int], published: Sequence[float
             raise DjetError(f'{folder} has {PLAIN} and {YAML}; remove the one that is not of '
                             'these images')
         return _of_yaml(ros, size)
-    values = tuple(published)
-    if plain.exists():
-        values = _of_text(plain)
+    values = _of_text(plain) if plain.exists() else tuple(published)
+    if published and not plain.exists() and size != _PUBLISHED_SIZE:
+        raise DjetError(f'{folder}: the published camera is of {_words(_PUBLISHED_SIZE)} pixels, '
+                        f"the images have {_words(size)}; write 'fx fy cx cy' of these into "
+                        f'{plain}')
     if not values:
         raise DjetError(f"{folder} has no known camera; write 'fx fy cx cy', perhaps with "
                         f"'k1 k2 p1 p2 k3', into {plain}, or name a file of ROS's "
@@ -105,8 +111,12 @@ def _of_yaml(path: Path, size: tuple[int, int]) -> Intrinsics:
 def _check_size(path: Path, calibrated: tuple[int, ...], size: tuple[int, int]) -> None:
     """Raise DjetError if a calibration is of another size (width, height) than the images."""
     if calibrated != size:
-        raise DjetError(f'{path} is of {one_line("x".join(map(str, calibrated)), 40)} pixels, the '
-                        f'images have {size[0]}x{size[1]}; calibrate at this size')
+        raise DjetError(f'{path} is of {_words(calibrated)} pixels, the images have '
+                        f'{_words(size)}; calibrate at this size')
+
+
+def _words(size: tuple[int, ...]) -> str:
+    return one_line('x'.join(map(str, size)), 40)
 
 
 def asl_camera(path: Path, size: tuple[int, int]) -> tuple[Intrinsics, Array]:
