@@ -623,6 +623,13 @@ def wrong_poses(tmp_path, bag):
     return [bag, '--poses', file]
 
 
+def poses_without_stamps(tmp_path, bag):
+    # As TartanAir has them.
+    file = tmp_path / 'poses.txt'
+    file.write_text('0 0 0 0 0 0 1\n' * FRAMES)
+    return [bag, '--poses', file]
+
+
 def bad_config(tmp_path, bag):
     file = tmp_path / 'bad.yaml'
     file.write_text('estimator: {windw: 5}\n')
@@ -636,6 +643,7 @@ def bad_config(tmp_path, bag):
     (late_info, f'has an earlier CameraInfo on {INFO_TOPIC} (the first one was recorded 8.000 s '
                 'after the first image); record it before'),
     (sepia, "'sepia'"), (short, '9 bytes'), (wrong_poses, '5 poses'),
+    (poses_without_stamps, 'begins with a row of 7 words; a TUM file has 8 numbers in a row'),
     (bad_config, "did you mean 'estimator.window'"),
     (lambda t, b: [b, '--method', 'sift'], "'sift'"),
     (lambda t, b: [b, '--scale', 'speed'], 'speed'),

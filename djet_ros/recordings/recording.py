@@ -367,8 +367,12 @@ def _why_not_one(what: str, name: str | None, have: Collection[str]) -> str:
 def _read_truth(path: Path, images: int) -> tuple[NDArray[np.int64] | None, Array]:
     """Return (stamps, poses) of a TUM file, or (None, poses) of a KITTI file, one per image."""
     first = next((text for _, text in lines(path)), '')
-    if len(first.replace(',', ' ').split()) == 8:
+    columns = len(first.replace(',', ' ').split())
+    if columns == 8:
         return read_tum(path)
+    if columns != 12:
+        raise DjetError(f'{path} begins with a row of {columns} words; a TUM file has 8 numbers '
+                        'in a row (stamp x y z qx qy qz qw), a KITTI file 12; convert it')
     poses = read_poses(path)
     if len(poses) != images:
         raise DjetError(f'{path} has {len(poses)} poses, the recording has {images} images; name '
