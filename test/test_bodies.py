@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from cards import Cards, K as CARDS_K, pose as card_pose
 from djet_ros.core.bodies import (
     are_of_one_motion,
     continuing_motion,
@@ -280,3 +281,19 @@ def test_while_a_lorry_is_overtaken_the_camera_keeps_its_own_motion(seed, first,
         before = view
     # Matches on the lorry are kept, as outliers.
     assert min(shares) < 0.4
+
+
+def test_of_a_body_of_which_only_a_few_matches_are_left_the_others_tell_the_motion() -> None:
+    cards, estimator = Cards(), TwoViewEstimator()
+    before, previous, current = (cards.gray(card_pose(x)) for x in (0.0, 0.2, 0.4))
+    before, previous = (estimator.view(gray, CARDS_K) for gray in (before, previous))
+    prior = estimator.estimate(before, previous)
+    # The pair before followed the left half; of that, now only a small part is in view.
+    left = prior.y[:, 0] < 160
+    prior = replace(prior, inliers=left, residuals=np.where(left, prior.residuals, 5.0))
+    hidden = np.full_like(current, 128)
+    hidden[:, 200:], hidden[90:110, 60:80] = current[:, 200:], current[90:110, 60:80]
+    pair = estimator.estimate(previous, estimator.view(hidden, CARDS_K), prior)
+    assert 0 < (pair.x[:, 0] < 160).sum() < estimator.config.min_matches
+    assert pair.status is Status.OK
+    assert direction_angle(pair.t, np.array([-1.0, 0, 0])) < 0.01

@@ -204,10 +204,12 @@ class TwoViewEstimator:
         """
         Estimate the motion of some matches (N,) of a pair; the others are outliers of the result.
 
-        The result is without them if some of those kept are attached to the camera.
+        The result is without them if it has no motion, or if some of those kept are attached to
+        the camera.
         """
         result = self.estimate_pair(pair.of(kept))
-        return with_left_out(result, pair, kept) if len(result.x) == kept.sum() else result
+        whole = len(result.inliers) == kept.sum()
+        return with_left_out(result, pair, kept) if whole else result
 
     def match(self, previous: View, current: View) -> Matches:
         """Match the features of two views: pixels x and y (N, 2), the most reliable first."""
