@@ -441,6 +441,23 @@ def test_landmarks_leave_the_window_once_each_at_their_true_position(cards):
     assert np.median(off) < 0.03
 
 
+def test_landmarks_are_those_of_the_reference_frame_while_it_waits(cards):
+    drive, kept = Drive(cards), 0
+    drive.go([pose(x=0.32 * (-1)**(number // 6), z=0.03) for number in range(14)])
+    for _ in range(24):
+        result, = drive.go([pose(yaw=0.02)])
+        here = drive.odometry.reference_pose
+        assert result.status is Status.NO_PARALLAX
+        depths = (drive.odometry.landmarks() @ here[:3, :3].T + here[:3, 3])[:, 2]
+        off = np.abs(depths[:, None] * np.hypot(0.32, 0.03) / DEPTHS - 1).min(1)
+        assert np.median(off) < 0.003
+        if not drive.odometry.newest_is_reference:
+            kept += 1
+            assert not np.array_equal(here, result.pose)
+            assert len(drive.odometry.landmarks(settled=True)) == 0
+    assert kept > 3
+
+
 def test_a_pair_with_other_depths_than_the_landmarks_disagrees(cards):
     """Sideways any depth fits two frames, as the epipolar lines are horizontal."""
     true_lengths = [pose(x=0.32)] * 8

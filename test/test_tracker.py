@@ -804,6 +804,19 @@ def test_landmarks_are_a_cloud_in_front_of_the_camera(drive):
     assert none.landmarks() is None
 
 
+def test_a_standstill_keeps_the_landmarks_without_a_new_one(drive):
+    one = tracker()
+    play(one, drive[:6])
+    moving = one.unsettled()
+    assert len(moving) > 20
+    for i in range(3):
+        play(one, [drive[5]], start=0.6 + 0.1 * i)
+        assert one.last.stationary
+        assert one.landmarks() is None
+        assert len(one.settled()) == 0
+        assert np.array_equal(one.unsettled(), moving)
+
+
 def test_speeds_give_the_length(drive):
     one = tracker(**{'odometry.scale': 'speed'})
     vector = message_type('geometry_msgs/msg/Vector3')

@@ -401,30 +401,23 @@ class Tracker:
             self._frame.stamp_ns, self._frame.frame_id, picture))
 
     def landmarks(self) -> Outgoing | None:
-        """Return the landmarks in the last frame; None without any."""
-        if self._frame is None or self.last is None or not self._moved \
+        """Return the landmarks in the last frame; None unless they were observed in it."""
+        if self.last is None or not self._odometry.newest_is_reference \
                 or not len(places := self._odometry.landmarks()):
             return None
         return Outgoing('landmarks', self._messages.landmarks(self.last, places))
 
     def settled(self) -> Array:
-        """Return landmarks (M, 3), in the first camera, that the last pair refined last."""
+        """Return landmarks (M, 3), in the first camera, that the last image refined last."""
         return self._in_first(self._odometry.landmarks(settled=True))
 
     def unsettled(self) -> Array:
-        """Return landmarks (M, 3), in the first camera, that the next pair may refine."""
+        """Return landmarks (M, 3), in the first camera, that the next image may refine."""
         return self._in_first(self._odometry.landmarks())
 
     def _in_first(self, places: Array) -> Array:
-        if self.last is None or not self._moved:
-            return np.empty((0, 3))
-        return np.asarray(places @ self.last.pose[:3, :3].T + self.last.pose[:3, 3])
-
-    @property
-    def _moved(self) -> bool:
-        """Return whether the motion of the last image was estimated."""
-        return self.last is not None and self.last.status in TRACKED \
-            and not self.last.stationary
+        pose = self._odometry.reference_pose
+        return np.asarray(places @ pose[:3, :3].T + pose[:3, 3])
 
     def _without_camera(self, stamp: int) -> list[Outgoing]:
         """Drop an image without a camera; an unusable CameraInfo stays the state."""

@@ -141,12 +141,24 @@ class VisualOdometry:
         """Return what landmarks have shown to be wrong with it; None until it is significant."""
         return self._scale.calibration
 
+    @property
+    def newest_is_reference(self) -> bool:
+        """Return whether the newest frame is the reference frame, so that landmarks are new."""
+        return self._last is not None and self._reference.frame is self._last
+
+    @property
+    def reference_pose(self) -> Array:
+        """Return the pose (4, 4) of the reference frame's camera in the first camera."""
+        return self._trajectory.pose
+
     def landmarks(self, settled: bool = False) -> Array:
         """
-        Return points (M, 3), the landmarks of the scale in the newest tracked camera.
+        Return points (M, 3), the landmarks of the scale in the reference frame's camera.
 
-        settled: instead return those that are not refined any more after that frame.
+        settled: instead return those that the newest frame was the last to refine.
         """
+        if settled and not self.newest_is_reference:
+            return np.empty((0, 3))
         return self._scale.landmarks(settled)
 
     def process(self, frame: Frame, view: View | None = None) -> OdometryResult:
