@@ -13,9 +13,10 @@ from djet_ros.core.types import RelativePose, Status
 from djet_ros.core.verdict import as_undecided
 from djet_ros.errors import DjetError
 from djet_ros.lab.scenes import make_scene
-from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.frame import continuity, Frame
 from djet_ros.odometry.inertial import Gyro, GyroNoise
 from djet_ros.odometry.messages import twist
+from djet_ros.odometry.order import Order
 from djet_ros.odometry.result import camera_motion
 from djet_ros.odometry.scale import (
     ConstantScale,
@@ -440,6 +441,18 @@ def test_a_gap_begins_a_new_reference_at_the_last_pose(cards):
     assert after.relative is None
     assert np.array_equal(after.pose, before.pose)
     assert np.diag(after.pose_covariance).min() > 1
+
+
+def test_a_time_of_exactly_max_gap_is_no_gap():
+    gray = np.zeros((48, 64), np.uint8)
+    for milliseconds in range(1, 1500):
+        max_gap, end = milliseconds / 1000, 10**18 + milliseconds * 10**6
+        order = Order(max_gap=max_gap)
+        order.take(10**18)
+        for beyond, status in enumerate((Status.OK, Status.TIME_JUMP)):
+            assert continuity(Frame(gray, K, 10**18), Frame(gray, K, end + beyond),
+                              max_gap) is status
+            assert order.follows_gap(end + beyond) == (status is Status.TIME_JUMP)
 
 
 def test_a_camera_may_have_started_to_move_in_a_gap(cards):

@@ -75,8 +75,7 @@ def continuity(previous: Frame, current: Frame, max_gap: float) -> Status:
     TIME_JUMP: a step back in time, or a gap of more than max_gap seconds; SIZE_CHANGED: another
     image size or camera matrix.
     """
-    gap = (current.stamp_ns - previous.stamp_ns) * 1e-9
-    if gap < 0 or gap > max_gap:
+    if not 0 <= current.stamp_ns - previous.stamp_ns <= round(max_gap * 1e9):
         return Status.TIME_JUMP
     if not of_same_camera(previous, current):
         return Status.SIZE_CHANGED

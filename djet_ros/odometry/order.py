@@ -24,7 +24,6 @@ class Order:
     def configure(self, max_backwards: float, max_gap: float) -> None:
         """Change the limits, in seconds; the stamps are kept."""
         self._backwards, self._gap = round(max_backwards * 1e9), round(max_gap * 1e9)
-        self._max_gap = max_gap
 
     def take(self, stamp_ns: int) -> None:
         """Set the newest stamp, also if time went back to it."""
@@ -39,7 +38,7 @@ class Order:
 
         The image after it decides which.
         """
-        return self.newest is not None and stamp_ns - self.newest > self._max_gap * 1e9
+        return self.newest is not None and stamp_ns - self.newest > self._gap
 
     def misplaced(self, stamp_ns: int, following_ns: int | None) -> str:
         """
