@@ -626,6 +626,23 @@ def test_a_frame_that_is_invalid_on_tf_is_reported_and_not_published(
     assert problems_of(one)[2] == {}
 
 
+@pytest.mark.parametrize('scale, metres, warned', [
+    ('structure', 0.4, True), ('none', 0.4, True), ('structure', 0.0, False),
+    ('constant', 0.4, False)])
+def test_a_camera_beside_its_base_needs_metres(drive, scale, metres, warned):
+    one = tracker(**{'odometry.base_frame': 'base_link', 'odometry.scale': scale,
+                     'odometry.scale_value': 0.2})
+    mounting = np.eye(4)
+    mounting[0, 3] = metres
+    one.mount(lambda *frames: mounting, 'camera')
+    play(one, drive[:2])
+    level, _, found = problems_of(one)
+    assert (level, *found) == (('WARN', 'base_frame without metres') if warned else ('OK',))
+    assert all(f"camera is 0.400 m from 'base_link', but odometry.scale is {scale}" in text
+               for text in found.values())
+    assert [one.name for one in one.complaints_of_content] == list(found)
+
+
 @pytest.mark.parametrize('parameters, parent, child', [
     ({}, 'odom', 'camera_frame'),
     ({'odometry.odom_frame': '/left/odom', 'odometry.camera_frame': '/left/cam'},

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.self_calibration import SelfCalibration
-from djet_ros.core.types import Status, TRACKED
+from djet_ros.core.types import Array, Status, TRACKED
 from djet_ros.odometry.images import FewLevels
 from djet_ros.odometry.masks import FREE
 from djet_ros.odometry.messages import camera_frame, mounted_frame, seconds_text
@@ -116,7 +116,7 @@ class Health:
         self._translated = self._translated or result.status is Status.OK
         measured = result.scale_kind is Scale.METRIC and result.measured
         self._measured = self._measured or measured
-        if measured or not self._asks_for_metres:
+        if measured or not asks_for_metres(self._config):
             self._unknown_lengths = 0
         elif result.status in TRACKED:
             self._unknown_lengths += 1
@@ -180,17 +180,13 @@ class Health:
             f'{no_transform(base, camera)}, which the odometry needs; '
             f'{publish_transform(base, camera)}'))
 
-    @property
-    def _asks_for_metres(self) -> bool:
-        return self._config.scale not in ('none', 'structure')
-
     def _length(self, scale: ScaleSource) -> Complaint | None:
         return (None if self._unknown_lengths < _IN_A_ROW
                 else self._no_length(scale, 'is measured', _REMEDIES))
 
     def never_measured(self, scale: ScaleSource) -> Complaint | None:
         """Return the problem that no length of a recording was measured, though configured."""
-        return (None if self._measured or not self._translated or not self._asks_for_metres
+        return (None if self._measured or not self._translated or not asks_for_metres(self._config)
                 else self._no_length(scale, 'was measured', _REMEDIES_RECORDED))
 
     def _no_length(self, scale: ScaleSource, what: str, remedies: dict[str, str]
@@ -239,6 +235,11 @@ class Health:
             'and the poses mix both'))
 
 
+def asks_for_metres(config: OdometryConfig) -> bool:
+    """Return whether the scale is to be metric."""
+    return config.scale not in ('none', 'structure')
+
+
 def no_transform(parent: str, child: str) -> str:
     """Return a text on a transform that is missing on tf."""
     return f"tf has no transform from '{parent}' to '{child}'"
@@ -258,6 +259,18 @@ def frame_mismatch(info_frame: str, image_frame: str) -> Complaint | None:
         f"the CameraInfo is of frame '{info_frame}', the images are of '{image_frame}'; if it "
         'is that of another camera, remap camera_info (--info-topic); if not, the driver should '
         'give both one frame_id'))
+
+
+def arm_without_metres(config: OdometryConfig, mounting: Array | None) -> Complaint | None:
+    """Return the problem that lengths of no known unit cannot be added to those of a mounting."""
+    metres = 0.0 if mounting is None else float(np.linalg.norm(mounting[:3, 3]))
+    if not config.base_frame or asks_for_metres(config) or not metres:
+        return None
+    return Complaint('base_frame without metres', 'WARN', (
+        f"the camera is {metres:.3f} m from '{config.base_frame}', but odometry.scale is "
+        f'{config.scale}, whose lengths are not in metres: as the camera turns, the pose of '
+        f"'{config.base_frame}' moves wrongly; choose a metric odometry.scale, or leave "
+        'odometry.base_frame empty'))
 
 
 def calibration_off(found: SelfCalibration | None) -> Complaint | None:

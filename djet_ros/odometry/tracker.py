@@ -19,6 +19,7 @@ from djet_ros.odometry.debug_image import debug_image
 from djet_ros.odometry.diagnostics import Counts, diagnose, Diagnosis, StampRate
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.health import (
+    arm_without_metres,
     calibration_off,
     Complaint,
     deviation_text,
@@ -337,22 +338,24 @@ class Tracker:
     @property
     def complaints(self) -> list[Complaint]:
         """Return the present problems and their remedies."""
-        more = self._of_calibration
+        more = self._of_camera
         return [*self._health.complaints(self._scale, self.mounted),
                 *(one for one in more if one is not None),
                 *self.complaints_of_inputs, *self.node_complaints]
 
     @property
-    def _of_calibration(self) -> tuple[Complaint | None, ...]:
+    def _of_camera(self) -> tuple[Complaint | None, ...]:
         frame = self.last.frame_id if self.last else ''
-        return calibration_off(self._odometry.calibration), frame_mismatch(self._info_frame, frame)
+        return (calibration_off(self._odometry.calibration),
+                frame_mismatch(self._info_frame, frame),
+                arm_without_metres(self.config.odometry, self._mounting))
 
     @property
     def complaints_of_content(self) -> list[Complaint]:
         """Return the problems of a whole recording."""
         found = (self._health.stamps_stood(), self._health.few_levels(),
                  self._health.never_measured(self._scale), self._health.two_cameras(),
-                 *self._of_calibration, *self.complaints_of_inputs)
+                 *self._of_camera, *self.complaints_of_inputs)
         return [one for one in found if one is not None]
 
     @property
