@@ -10,7 +10,7 @@ from typing import Any
 
 from cards import Cards, K, pose, SIZE
 import cv2
-from djet_ros.config.flat import from_flat
+from djet_ros.config.flat import from_flat, with_values
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.geometry import direction_angle, rotation_angle
 from djet_ros.core.masks import blocked, masked_at
@@ -201,6 +201,19 @@ def test_a_gyro_with_a_wrong_mounting_is_reported_and_not_used() -> None:
         one.image(long.image(i))
     assert 'gyro does not fit' in diagnostics(one)
     assert one.last is not None and one.last.status.value == 'OK'
+
+
+def test_a_rotation_of_the_imu_that_is_taken_back_is_looked_up_on_tf(drive: Drive) -> None:
+    one = tracker(**{**IMU, 'odometry.imu_rotation': '0 0 0 1'})
+    for message in drive.imu():
+        one.imu(message)
+    assert not one.wants_frames
+    one.configure(with_values(one.config, {'odometry.imu_rotation': ''}))
+    assert one.wants_frames
+    assert one.missing_mountings('camera') == {'imu': ('camera', 'imu')}
+    one.mount_sensor('imu', np.eye(4))
+    one.configure(with_values(one.config, {'odometry.max_lost': 5}))
+    assert not one.wants_frames
 
 
 @pytest.mark.parametrize('text', ['1 0 0', '1 1 1 1', 'a b c d', 'nan 0 0 1'])

@@ -42,12 +42,13 @@ class AuxiliaryInputs:
         self.guess: Guess | None = None
         self._masks = Masks(static_mask)
         self._frames: dict[str, str] = {}
+        self._config = config
         self.configure(config, scale)
         self.reset()
 
     def configure(self, config: OdometryConfig, scale: ScaleSource) -> None:
         """Change the parameters; the state of inputs that stay configured is kept."""
-        self._config = config
+        before, self._config = self._config, config
         noise = GyroNoise(config.imu_noise, config.imu_bias_walk)
         offset = round(config.imu_offset * 1e9)
         if not config.imu:
@@ -58,6 +59,9 @@ class AuxiliaryInputs:
             self.gyro.configure(noise, offset)
         if self.gyro is not None and (quaternion := config.imu_quaternion()) is not None:
             self.gyro.mount(Rotation.from_quat(quaternion).as_matrix())
+        elif self.gyro is not None and before.imu_quaternion() is not None:
+            # From now on the one of tf counts.
+            self.gyro.mount(None)
         fixed = self.guess.fixed if isinstance(self.guess, FrameGuess) else ''
         if not (config.guess or isinstance(scale, GuessScale)):
             self.guess = None

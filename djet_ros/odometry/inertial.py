@@ -114,8 +114,8 @@ class Gyro:
         self._latest: tuple[tuple[object, ...], _Integral | None] | None = None
         self.refused: Counter[str] = Counter()
 
-    def mount(self, to_camera: Array) -> None:
-        """Set the rotation (3, 3) of the IMU's axes to those of the camera."""
+    def mount(self, to_camera: Array | None) -> None:
+        """Set the rotation (3, 3) of the IMU's axes to those of the camera; None: not known."""
         self.to_camera = to_camera
 
     def add(self, stamp_ns: int, rate: Array) -> None:
