@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from cards import Cards, K as CARDS_K, pose as card_pose
 from djet_ros.core.covariance import calibration_covariance, pose_covariance, widened_by_profile
 from djet_ros.core.estimator import TwoViewEstimator
-from djet_ros.core.estimator_config import preset
+from djet_ros.core.estimator_config import EstimatorConfig, preset
 from djet_ros.core.geometry import rotation_log, sphere_log, sphere_tangents, unit
 from djet_ros.core.jet import epipolar_residuals, jet_problem, Loss, minimise, Residuals, retract
 from djet_ros.core.paraboloid import Paraboloids
@@ -43,6 +44,23 @@ def test_exact_matches_have_a_tiny_but_finite_covariance():
     covariance, _ = pose_covariance(exact, Loss(), rng.uniform(0, 400, (100, 2)), t, False)
     variances = np.linalg.eigvalsh(covariance)
     assert np.isfinite(variances).all() and (variances < 1e-8).all()
+
+
+def test_no_variance_is_negative_where_the_pose_is_not_at_the_minimum() -> None:
+    # Of the 5-point algorithm residuals are not noise, and cells pull in opposite directions.
+    cards, rng, determined = Cards(3), np.random.default_rng(3), 0
+    for number in range(6):
+        here = card_pose(*rng.uniform(-0.6, 0.6, 3) * (1, 0.3, 1))
+        step = card_pose(*rng.uniform(-0.3, 0.3, 3), yaw=rng.uniform(-0.03, 0.03))
+        estimator = TwoViewEstimator(EstimatorConfig(
+            method='five_point', max_features=(250, 500, 1000)[number % 3]))
+        pair = estimator.estimate(*(
+            estimator.view(cards.gray(there, noise=noise), CARDS_K)
+            for there, noise in ((here, number), (here @ step, number + 50))))
+        if np.isfinite(pair.covariance_5).all():
+            determined += 1
+            assert np.linalg.eigvalsh(pair.covariance_5)[0] > 0
+    assert determined > 3
 
 
 def calibrated(K: np.ndarray, f: float = 0.0, cx: float = 0.0, cy: float = 0.0) -> np.ndarray:

@@ -75,6 +75,11 @@ _MIN_SUPPORT = 1e-6
 _UPPER = np.triu_indices(5)
 _FULL = [i * (9 - i) // 2 + j for i, j in map(sorted, np.ndindex(5, 5))]
 
+# chosen: least share of the variance by independent errors that correlated ones leave. Cells that
+# pull in opposite directions make it less; but their correlation is a model, and a coarse one for
+# errors that are no noise, as where the pose is not at the minimum: by it variances got negative.
+_LEAST_LEFT = 0.01
+
 # chosen: share of a cell in the information, summed over the five directions, from which on its
 # eigenvalues are checked.
 _HEAVY = 0.9
@@ -113,8 +118,8 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     size = cells.size(shifts)
     independent = _jackknife(cells, inverses_left, shifts)
     noise = float((weights * squared).sum() / weights.sum())
-    covariance = independent + _correlated(pulls, products, cells.inverse, independent, size,
-                                           noise)
+    covariance = _at_least(_LEAST_LEFT, independent, independent + _correlated(
+        pulls, products, cells.inverse, independent, size, noise))
     # By rounding it may be less, if a direction is hardly determined.
     growth = max(float(np.trace(np.linalg.solve(independent, covariance))) / 5, 1.0)
     covariance += growth * size * _small_sample_widening(cells, growth)
@@ -367,6 +372,18 @@ def _correlated(pulls: Array, products: Array, inverse: Array, independent: Arra
         observed -= coefficient * expected[nearest]
     total = _weighted_sum(coefficients[_SMALL_CELLS:], pulls[_SMALL_CELLS:])
     return np.asarray(inverse @ total @ inverse)
+
+
+def _at_least(share: float, independent: Array, covariance: Array) -> Array:
+    """Return a covariance (5, 5), in no direction below a share of the independent one."""
+    variances, axes = np.linalg.eigh(independent)
+    root = axes * np.sqrt(np.maximum(variances, 1e-14 * variances[-1]))
+    inverse = np.linalg.inv(root)
+    shares, axes = np.linalg.eigh(inverse @ covariance @ inverse.T)
+    if shares[0] >= share:
+        return covariance
+    half = root @ axes
+    return np.asarray((half * np.maximum(shares, share)) @ half.T)
 
 
 def _weighted_sum(shares: Array, parts: Array) -> Array:
