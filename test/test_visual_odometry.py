@@ -421,6 +421,20 @@ def test_measurements_of_the_new_time_before_its_first_image_are_kept(cards, sou
 
 
 @pytest.mark.parametrize('source', [SpeedScale, by_guess])
+def test_measurements_of_a_looping_bag_are_kept_though_their_stamps_are_known(source):
+    scale = source()
+    for _ in range(2):
+        for i in range(20):
+            measure(scale, i * 10**8, 0.25 * i)
+    # Its first speeds and poses come before its first image, which is of the new time then.
+    measure(scale, 0, 0.0)
+    measure(scale, 10**8, 0.25)
+    scale.go_back(0)
+    assert scale.between(0, 10**8).known
+    assert not scale.between(10**9, 11 * 10**8).known
+
+
+@pytest.mark.parametrize('source', [SpeedScale, by_guess])
 def test_measurements_of_the_old_time_are_forgotten(cards, source):
     """A bag is played again from its middle, without its speeds."""
     scale = source()

@@ -33,10 +33,12 @@ class PoseTrack:
 
     def add(self, stamp_ns: int, pose: Array) -> None:
         """Take a pose (4, 4); NaN, and a second one with the same stamp, are ignored."""
-        if not np.isfinite(pose).all() or stamp_ns in self._poses:
+        if not np.isfinite(pose).all():
             return
+        # First, as a bag that loops repeats its stamps.
         self.go_back(stamp_ns)
-        self._poses.add(stamp_ns, pose)
+        if stamp_ns not in self._poses:
+            self._poses.add(stamp_ns, pose)
 
     def covers(self, stamp_ns: int) -> bool:
         """Return whether there is a pose at a stamp, or after it."""

@@ -225,10 +225,12 @@ class SpeedScale(ScaleSource):
 
     def add_speed(self, stamp_ns: int, metres_per_second: float) -> None:
         """Take a measured speed; an impossible one, or one with a known stamp, is ignored."""
-        if not abs(metres_per_second) <= _FASTEST or stamp_ns in self._speeds:
+        if not abs(metres_per_second) <= _FASTEST:
             return
+        # First, as a bag that loops repeats its stamps.
         self.go_back(stamp_ns)
-        self._speeds.add(stamp_ns, abs(float(metres_per_second)))
+        if stamp_ns not in self._speeds:
+            self._speeds.add(stamp_ns, abs(float(metres_per_second)))
 
     def between(self, start_ns: int, end_ns: int) -> Length:
         """Integrate the speed from start to end."""
