@@ -407,6 +407,7 @@ def test_without_parallax_only_the_rotation_is_fused() -> None:
     R, off = rotation_exp(rng.normal(size=3)), 1e-6 * rng.normal(size=3)
     visual = replace(pair(R, unit(rng.normal(size=3)), covariance),
                      status=Status.NO_PARALLAX, t=np.zeros(3))
+    before = visual.covariance_6.copy()
     found = fused(visual, MeasuredRotation(rotation_exp(off) @ R, of_turn))
     both = np.linalg.inv(np.linalg.inv(covariance[:3, :3]) + np.linalg.inv(of_turn))
     assert np.allclose(rotation_log(found.R @ R.T), both @ np.linalg.solve(of_turn, off),
@@ -415,6 +416,7 @@ def test_without_parallax_only_the_rotation_is_fused() -> None:
     assert np.allclose(found.covariance_6[:3, :3], both)
     assert np.array_equal(found.covariance_6[3:, 3:], visual.covariance_6[3:, 3:])
     assert not found.covariance_6[:3, 3:].any() and not found.covariance_6[3:, :3].any()
+    assert np.array_equal(visual.covariance_6, before)
 
 
 def test_a_rotation_without_information_changes_nothing() -> None:

@@ -132,6 +132,31 @@ def test_residuals_are_down_weighted_near_the_epipole():
     assert np.allclose(blurred.r / sharp.r, across / np.hypot(across, 5))
 
 
+@pytest.mark.parametrize('curvature', [7.0, -0.02])
+def test_residuals_are_in_pixels_however_curved_all_surfaces_are(curvature):
+    """So that losses of different surfaces can be compared; upside down only the sign differs."""
+    seen = two_views(np.random.default_rng(5))
+    y = seen.y + 0.5
+    there = circles(y)
+    curved = Paraboloids(y, curvature * there.A, there.b, there.c, there.usable)
+    one, other = (epipolar_residuals(jet_problem(K, seen.x, each, epipole_blur=20.0),
+                                     seen.R, seen.t) for each in (there, curved))
+    np.testing.assert_allclose(other.r, one.r, rtol=1e-9)
+    assert (other.sign == np.sign(curvature)).all()
+
+
+def test_by_its_fit_a_match_is_as_certain_as_its_surface_is_low_within_bounds():
+    """The value at the minimum is a noisy estimate of the variance; zero makes nothing certain."""
+    seen = two_views(np.random.default_rng(5))
+    y, there = seen.y + 0.5, circles(seen.y + 0.5)
+    values = np.full(len(y), 8.0)
+    values[:4] = 0.0, 4.0, 32.0, 0.5
+    surfaces = Paraboloids(y, there.A, there.b, values, there.usable)
+    alike, by_fit = (epipolar_residuals(jet_problem(K, seen.x, surfaces, by_fit=each),
+                                        seen.R, seen.t).r for each in (False, True))
+    np.testing.assert_allclose((alike / by_fit)[:5]**2, (0.25, 0.5, 4, 0.25, 1), rtol=1e-9)
+
+
 def test_a_flat_surface_has_no_weight():
     seen = two_views(np.random.default_rng(5))
     surfaces = circles(seen.y + 0.5)

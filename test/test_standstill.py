@@ -216,6 +216,36 @@ def test_what_may_be_a_bonnet_is_no_standstill_of_a_camera_that_has_not_stood() 
         assert detected(before, pair, at_rest=None) is stands
 
 
+def test_a_bonnet_with_most_of_the_features_is_no_standstill() -> None:
+    """It fills less of the image than they are of all."""
+    bonnet = np.random.default_rng(4).uniform((0, 300), (1240, 376), (1000, 2))
+    pair = seen(np.vstack([WORLD, bonnet]), np.vstack([WORLD + 60 * RIGHT, bonnet]))
+    assert not detected(Standstill(), pair, at_rest=None)
+
+
+def test_with_a_gyro_at_rest_what_is_still_below_the_horizon_is_no_bonnet() -> None:
+    ground = WORLD[:, 1] > 230
+    pair = seen(WORLD, WORLD + np.where(ground, 0.0, 60.0)[:, None] * RIGHT, ~ground)
+    for at_rest, stands in ((True, True), (None, False)):
+        assert detected(Standstill(), pair, at_rest) is stands
+        assert likely_stands(Standstill(), pair, at_rest) is stands
+
+
+def test_without_a_gyro_a_standstill_needs_more_still_matches() -> None:
+    for share, by_gyro, by_images in ((0.3, True, True), (0.1, True, False)):
+        pair = some_move((share, 0.0), (1 - share, 60.0))
+        assert detected(Standstill(), pair, at_rest=True) is by_gyro
+        assert detected(Standstill(), pair, at_rest=None) is by_images
+
+
+def test_matches_as_noisy_as_the_threshold_are_no_slow_start() -> None:
+    """Half of them move slightly, but with no common drift."""
+    rng = np.random.default_rng(14)
+    pair = seen(WORLD, WORLD + rng.normal(0, 0.8 * MOST, WORLD.shape))
+    for at_rest in (True, None):
+        assert likely_stands(Standstill(), pair, at_rest)
+
+
 def test_what_stayed_in_place_while_the_camera_moved_is_attached_to_it() -> None:
     bonnet = WORLD[:, 1] > 250
     drives = seen(WORLD, WORLD + np.where(bonnet, 0.0, 60.0)[:, None] * RIGHT)
@@ -231,6 +261,19 @@ def test_what_stayed_in_place_while_the_camera_moved_is_attached_to_it() -> None
     depart(standstill)
     standstill.stay(seen(WORLD, WORLD), MOST)
     assert detected(standstill, lost, at_rest=None)
+
+
+@pytest.mark.parametrize('other_camera', [False, True])
+def test_after_a_gap_the_bonnet_of_the_same_camera_is_still_attached_to_it(
+        other_camera: bool) -> None:
+    bonnet = WORLD[:, 1] > 250
+    standstill = Standstill()
+    depart(standstill, seen(WORLD, WORLD + np.where(bonnet, 0.0, 60.0)[:, None] * RIGHT))
+    standstill.interrupt(other_camera)
+    assert standstill.may_stand
+    standstill.stay(seen(WORLD, WORLD), MOST)
+    lost = seen(WORLD, np.where(bonnet[:, None], WORLD, scattered(WORLD)))
+    assert detected(standstill, lost, at_rest=None) is other_camera
 
 
 def test_a_camera_that_starts_slowly_above_a_bonnet_does_not_stand() -> None:
@@ -266,11 +309,14 @@ def test_a_camera_is_not_stationary_for_long_behind_what_hides_the_rest() -> Non
 def test_a_standstill_is_the_previous_motion_of_the_next_pair_unless_much_moves() -> None:
     standstill = Standstill()
     assert standstill.prior is None
-    standstill.stay(some_move((0.95, 0.05), (0.05, 60.0)), MOST)
+    noise = rotation_exp(np.array([1e-4, 0, 0]))
+    pair = replace(some_move((0.95, 0.05), (0.05, 60.0)), R=noise)
+    standstill.stay(pair, MOST)
     prior = standstill.prior
-    assert prior is not None
+    assert prior is not None and prior.status is Status.NO_PARALLAX
+    assert prior.residuals == pytest.approx(np.linalg.norm(pair.y - pair.x, axis=1))
     assert not prior.t.any() and np.array_equal(prior.R, np.eye(3))
-    assert np.array_equal(prior.y_opt, prior.x)
+    assert np.array_equal(prior.y, prior.x) and np.array_equal(prior.y_opt, prior.x)
     assert prior.inliers.mean() == pytest.approx(0.95, abs=0.03)
     standstill.stay(some_move((0.7, 0.05), (0.3, 60.0)), MOST)
     assert standstill.prior is None
@@ -291,6 +337,49 @@ def test_a_camera_that_vibrates_stood_and_one_that_turns_did_not() -> None:
 CENTRE = np.array([620.0, 188.0])
 DRIFTS = {'to the side': np.tile(RIGHT, (400, 1)), 'ahead': (WORLD - CENTRE) / 300,
           'about the axis': (WORLD - CENTRE)[:, ::-1] * (1, -1) / 300}
+
+
+@pytest.mark.parametrize('at_rest', [True, None])
+@pytest.mark.parametrize('drift', DRIFTS.values(), ids=DRIFTS.keys())
+def test_a_camera_that_starts_at_once_does_not_stand_whichever_way_it_goes(
+        drift: Array, at_rest: bool | None) -> None:
+    """Features beside one another move alike, but those at the border of the image faster."""
+    away = seen(WORLD, WORLD + 60 * drift)
+    assert not detected(after_a_stand(), away, at_rest)
+    assert not likely_stands(after_a_stand(), away, at_rest)
+
+
+def test_a_camera_that_starts_slowly_is_not_one_that_vibrates() -> None:
+    """All features move by the same little, and not most of them by more."""
+    away = seen(WORLD, WORLD + 2 * MOST * RIGHT)
+    assert not detected(after_a_stand(), away, at_rest=None)
+    assert not likely_stands(after_a_stand(), away, at_rest=None)
+
+
+def test_still_mountains_are_no_standstill_of_a_camera_that_starts() -> None:
+    """Without a gyro it is enough that what stood moves together in more of the image."""
+    far = WORLD[:, 1] < 0.4 * HORIZON
+    away = seen(WORLD, WORLD + np.where(far, 0.0, 60.0)[:, None] * RIGHT, ~far)
+    assert not detected(after_a_stand(), away, at_rest=None)
+
+
+def test_what_moves_by_many_thresholds_does_not_move_slightly() -> None:
+    """A few pixels are a start of none but the nearest things, such as people."""
+    for pixels, likely in ((2 * MOST, False), (10 * MOST, True)):
+        pair = some_move((0.1, 0.0), (0.3, pixels), (0.6, 60.0))
+        assert likely_stands(Standstill(), pair, at_rest=True) is likely
+
+
+def test_one_feature_is_no_evidence_of_a_start() -> None:
+    one = seen(WORLD[:1], WORLD[:1] + 60 * RIGHT)
+    assert likely_stands(after_a_stand(), one, at_rest=True)
+    assert not detected(after_a_stand(), one, at_rest=True)
+
+
+def test_static_features_prove_a_standstill_of_a_pair_without_any_motion() -> None:
+    """Of too few matches none is an inlier of anything."""
+    pair = replace(behind_a_lorry(40), status=Status.DEGENERATE, inliers=np.empty(0, bool))
+    assert detected(after_a_stand(), pair, at_rest=True)
 
 
 @pytest.mark.parametrize('drift', DRIFTS.values(), ids=DRIFTS.keys())
