@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from djet_ros.core.geometry import (
+    chirality_signs,
     depth_ratio,
+    depths_in_second,
     direction_angle,
     epipolar_lines,
     essential,
@@ -18,6 +20,7 @@ from djet_ros.core.geometry import (
     rays,
     rotation_angle,
     rotation_exp,
+    rotation_log,
     singular_values,
     skew,
     slant_warp,
@@ -64,6 +67,21 @@ def test_vectorised_functions_agree_with_single_calls():
     v = np.random.default_rng(2).normal(size=(7, 3))
     assert np.allclose(rotation_exp(v), [rotation_exp(one) for one in v], atol=1e-14)
     assert (sphere_tangents(unit(v)) == [sphere_tangents(unit(one)) for one in v]).all()
+
+
+@given(directions)
+@example(np.array([0.0, 1.0, 0.0]))
+def test_the_logarithm_of_a_half_turn_is_about_its_axis_either_way(axis):
+    omega = rotation_log(2 * np.outer(axis, axis) - np.eye(3))
+    assert abs(omega @ axis) == pytest.approx(np.pi)
+    assert norms(omega) == pytest.approx(np.pi)
+
+
+@given(directions)
+@example(np.array([0.0, 0.0, 1.0]))
+@example(np.array([1.0, 0.0, 0.0]))
+def test_the_arc_to_the_opposite_direction_is_half_a_turn(t):
+    assert norms(sphere_log(t, -t)) == pytest.approx(np.pi)
 
 
 def test_the_logarithm_of_a_direction_is_the_arc_towards_it():
@@ -139,6 +157,27 @@ def test_only_the_true_one_of_four_motions_has_all_points_in_front(t, near, far)
         assert np.allclose(np.abs(np.einsum('ni,ij,nj->n', rays_y, essential(R, t), rays_x)), 0,
                            atol=1e-9)
         assert not in_front(R, t, rays_x, rays_y).any()
+
+
+@pytest.mark.parametrize('t', [SIDEWAYS, FORWARD, BACKWARD])
+def test_each_point_votes_for_the_sign_that_brings_it_in_front_of_both_cameras(t):
+    seen = two_views(np.random.default_rng(8), t=t)
+    before, after = rays(K, seen.x), rays(K, seen.y)
+    for sign in (1, -1):
+        votes = chirality_signs(seen.R, sign * seen.t, before, after)
+        assert np.array_equal(votes, np.full(len(before), sign))
+    # One that looks back sees nothing of what the other one does.
+    back = Rotation.from_rotvec([0, np.pi, 0]).as_matrix()
+    behind = seen.points @ back.T + seen.t
+    assert not chirality_signs(back, seen.t, before, behind / behind[:, 2:]).any()
+
+
+@pytest.mark.parametrize('t', [SIDEWAYS, FORWARD, BACKWARD])
+def test_depths_in_the_second_camera_are_those_of_the_moved_points(t):
+    seen = two_views(np.random.default_rng(9), t=t, K=SKEWED)
+    depths = seen.points[:, 2]
+    grown = depths_in_second(seen.R, seen.t, rays(SKEWED, seen.x), 1 / depths)
+    assert np.allclose(grown * depths, project(SKEWED, seen.points @ seen.R.T + seen.t)[1])
 
 
 def test_chirality_is_decided_per_point():

@@ -813,13 +813,15 @@ def factors(metres, alike):
     return np.array(found).T
 
 
-def test_the_variance_of_the_factor_is_consistent_with_correlated_lengths():
+@pytest.mark.parametrize('step', [1.0, 0.25])
+def test_the_variance_of_the_factor_is_consistent_with_correlated_lengths(step):
+    """Of steps, in metres, eight in a row have one error."""
     rng, squares = np.random.default_rng(0), {0: [], 8: []}
     for _ in range(60):
-        metres = np.exp(np.repeat(rng.normal(0, 0.02, 20), 8))
+        metres = step * np.exp(np.repeat(rng.normal(0, 0.02, 20), 8))
         for alike, ended in squares.items():
-            logs, variances, _ = factors(metres, alike)
-            ended.append(logs[-1]**2 / variances[-1])
+            logs, variances, _ = factors(metres, alike * step)
+            ended.append((logs[-1] - np.log(step))**2 / variances[-1])
     assert 0.5 < np.mean(squares[8]) < 1.5
     # As independent measurements they would give far too small a variance.
     assert np.mean(squares[0]) > 3
@@ -992,14 +994,17 @@ def test_of_the_error_of_a_factor_that_two_lengths_correct_less_is_kept():
         assert scale.scaled(2.0, 0.0, True).common.kept[0] == pytest.approx(kept)
 
 
-def wandered(rng, seconds):
+def wandered(rng, seconds, measured):
     """
     Move at a speed of about one, seen in a unit that wanders by a factor of e in a second.
 
-    Returns errors of the log factor, variances and kept shares (3, N).
+    measured: before which second a length in metres becomes known. Returns errors of the log
+    factor, variances and kept shares (3, N).
     """
     scale, factor, usual, found = ScaleFilter(), 0.0, 0.0, []
-    for _ in range(seconds):
+    for second in range(seconds):
+        if second == measured:
+            scale.update(Length(np.exp(factor), 0.0, True), 1.0, 0.0, 1.0)
         usual += rng.normal(0, np.sqrt(0.05))
         factor += rng.normal(0, 1.0)
         scale.add_noise(1.0)
@@ -1009,10 +1014,11 @@ def wandered(rng, seconds):
     return np.array(found).T
 
 
-def test_where_landmarks_lose_the_scale_the_usual_speed_bounds_its_drift():
+@pytest.mark.parametrize('measured', [None, 0, 30])
+def test_where_landmarks_lose_the_scale_the_usual_speed_bounds_its_drift(measured):
     """By itself it would drift by 1.0 times the root of the number of seconds."""
     rng = np.random.default_rng(0)
-    runs = np.array([wandered(rng, 60) for _ in range(200)])
+    runs = np.array([wandered(rng, 60, measured) for _ in range(200)])
     errors, variances, kept = runs[:, 0], runs[0, 1], runs[0, 2]
     assert np.std(errors[:, -1]) < 0.5 * np.sqrt(60)
     assert (errors**2).mean(0) == pytest.approx(variances, rel=0.3)
@@ -1060,6 +1066,14 @@ def test_the_usual_speed_is_the_same_in_metres_and_in_another_unit():
             scale.moved(units, 1.0, True)
         found[change] = scale.factor
     assert found == pytest.approx({'metres': 3.0, 'unit': 1.0, 'nothing': 1.0}, rel=1e-4)
+
+
+def test_lengths_in_metres_stay_as_long_when_a_correction_changes_the_unit():
+    scale = metric()
+    before = scale.scaled(2.0, 0.01, True)
+    scale.unit_changed(1.5)
+    after = scale.scaled(3.0, 0.01, True)
+    assert (after.value, after.sigma) == pytest.approx((before.value, before.sigma))
 
 
 def crept(scale, steps, units, hertz=30):

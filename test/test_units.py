@@ -6,8 +6,9 @@ from djet_ros.config.sections import Config
 from djet_ros.core.geometry import rotation_exp, unit
 from djet_ros.core.types import RelativePose, Status
 from djet_ros.odometry.frame import Frame
+from djet_ros.odometry.scale import Length
 from djet_ros.posegraph.pose_graph import Edge, PoseGraph
-from djet_ros.posegraph.shared_points import log_scale_ratio
+from djet_ros.posegraph.shared_points import log_scale_ratio, transferred_length
 from djet_ros.posegraph.steps import Step
 from djet_ros.posegraph.units import log_units, rescaled_edge, to_common_unit
 import numpy as np
@@ -174,6 +175,20 @@ def test_scale_ratio_from_depths():
     few = RelativePose(Status.OK, x=other.x[:9], y=other.y[:9], y_opt=other.y_opt[:9],
                        inliers=np.ones(9, bool), R=other.R, t=other.t)
     assert log_scale_ratio(step, 1.0, loop, 1.0, few, 1.0, K) is None
+
+
+def test_neither_points_without_parallax_nor_a_motion_of_the_wrong_sign_tell_a_length():
+    K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
+    points = np.random.default_rng(2).uniform((-6, -3, 8), (6, 3, 30), (200, 3))
+    turn, length = rotation_exp(np.array([0.0, -0.05, 0.01])), Length(2.0, 0.01, True)
+    ways = np.array([[0.1, 0, 1.0], [0.4, 0.1, -0.3]])
+    step, other = (pair(points, turn, way, K)[0] for way in ways)
+    found = transferred_length(step, other, length, K)
+    assert found.known
+    assert found.value == pytest.approx(2 * np.linalg.norm(ways[1]) / np.linalg.norm(ways[0]))
+    assert not transferred_length(step, replace(other, t=-other.t), length, K).known
+    far, farther = (pair(1e4 * points, turn, way, K)[0] for way in ways)
+    assert not transferred_length(far, farther, length, K).known
 
 
 def test_edges_of_a_removed_keyframe_are_rescaled_to_its_successor(monkeypatch):
