@@ -6,7 +6,7 @@ from itertools import pairwise
 import math
 
 from djet_ros.core.geometry import rotation_exp
-from djet_ros.replay.drift import Drift, drift, path_scale
+from djet_ros.replay.drift import Drift, drift, path_length, path_scale
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -113,6 +113,11 @@ def test_a_path_in_another_unit_and_axes_has_the_scale_of_its_spread() -> None:
     assert path_scale(np.tile(truth[3], (len(truth), 1)), truth) == 1
 
 
+def test_a_path_is_as_long_as_its_steps_together() -> None:
+    assert path_length(np.array([[1.0, 0, 0], [1, 3, 4], [1, 3, 4], [3, 2, 2]])) == 5 + 0 + 3
+    assert path_length(np.ones((1, 3))) == 0
+
+
 def test_no_drift_below_100_metres() -> None:
     assert drift(straight(100), straight(100)) is None
     assert drift(straight(101), straight(101)) == Drift(0.0, 0.0, 1, 100)
@@ -124,6 +129,7 @@ def test_no_drift_below_100_metres() -> None:
     (straight(10), straight(11), r'are \(11, 4, 4\) and \(12, 4, 4\)'),
     (straight(10)[:, :3], straight(10)[:, :3], r'\(11, 3, 4\); both must be \(N, 4, 4\)'),
     (straight(10), straight(10) * np.nan, 'not finite'),
+    (straight(10) * np.nan, straight(10), 'not finite'),
 ])
 def test_incomparable_trajectories_are_refused(
         truth: Poses, estimate: Poses, message: str) -> None:

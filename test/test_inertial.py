@@ -141,13 +141,39 @@ def test_the_covariance_is_that_of_white_noise_and_of_the_bias() -> None:
     assert scatter / np.diag(turn.covariance).mean() == pytest.approx(1, abs=0.25)
 
 
+def test_a_rotation_whose_rate_changes_between_samples_is_less_certain_than_one_at_a_constant_rate(
+        ) -> None:
+    even, jerking = mounted(), mounted()
+    for i in range(11):
+        even.add(i * 10_000_000, np.array([1.0, 0, 0]))
+        jerking.add(i * 10_000_000, np.array([2.0 * (i % 2), 0, 0]))
+    one, other = (gyro.turn(0, PERIOD) for gyro in (even, jerking))
+    assert one is not None and other is not None
+    assert rotation_angle(one.R, other.R) < 1e-9
+    assert (np.linalg.eigvalsh(other.covariance - one.covariance) > 0).all()
+
+
+def test_a_bias_is_learned_from_one_sure_rotation_however_the_axes_turn_meanwhile() -> None:
+    """By 90 degrees about one axis, then another, and back again by both."""
+    bias, exact, biased = np.array([1e-3, -2e-3, 1.5e-3]), mounted(), mounted()
+    about = [(1.9, 0, 0), (0, 1.9, 0), (0, -1.9, 0), (-1.9, 0, 0)]
+    for i in range(641):
+        rate = np.array(about[min(i // 160, 3)])
+        exact.add(i * 5_000_000, rate)
+        biased.add(i * 5_000_000, rate + bias)
+    turn = exact.turn(0, 640 * 5_000_000)
+    assert turn is not None
+    biased.learn(0, 640 * 5_000_000, turn.R, np.eye(3) * 1e-12)
+    assert np.linalg.norm(biased.bias - bias) < 0.05 * np.linalg.norm(bias)
+
+
 # Invalid samples
 
 def test_without_a_mounting_or_with_a_gap_there_is_no_rotation() -> None:
     unmounted = Gyro(NOISE)
     for i in range(100):
         unmounted.add(i * 5_000_000, np.zeros(3))
-    assert unmounted.turn(0, PERIOD) is None
+    assert unmounted.turn(0, PERIOD) is None and unmounted.at_rest(0, PERIOD) is None
     gyro = mounted()
     for i in [*range(100), *range(200, 300)]:
         gyro.add(i * 5_000_000, np.zeros(3))
@@ -181,11 +207,12 @@ def test_invalid_rates_are_ignored(rate: float) -> None:
     assert np.allclose(Rotation.from_matrix(turn.R.T).as_rotvec(), [0, 0, 0.1])
 
 
-def test_a_saturated_gyro_measures_no_rotation() -> None:
+@pytest.mark.parametrize('way', [1, -1])
+def test_a_saturated_gyro_measures_no_rotation(way: int) -> None:
     gyro = mounted()
     for i in range(200):
         faster = 20 * np.sin(np.pi * i / 200)
-        gyro.add(i * 5_000_000, np.array([0.001 * i, 0, min(faster, 8.7)]))
+        gyro.add(i * 5_000_000, np.array([0.001 * i, 0, way * min(faster, 8.7)]))
     assert gyro.refused['end of its range'] > 50
     assert gyro.turn(400_000_000, 500_000_000) is None
     assert gyro.turn(0, PERIOD) is not None
