@@ -2,12 +2,12 @@
 
 from itertools import combinations
 
-from djet_ros.core.basins import better_by_parts, choose_basin
+from djet_ros.core.basins import better_by_parts, choose_basin, choose_predicted_basin
 from djet_ros.core.covariance import CHI2_999, pose_difference
 from djet_ros.core.estimator_config import EstimatorConfig
-from djet_ros.core.geometry import rays, rotation_exp, unit
+from djet_ros.core.geometry import rays, rotation_angle, rotation_exp, unit
 from djet_ros.core.jet import epipolar_residuals, JetProblem, Loss, minimise
-from djet_ros.core.rivals import pose_distance
+from djet_ros.core.rivals import pose_distance, PreviousMotion
 from djet_ros.core.starts import hemisphere_starts
 from djet_ros.core.types import Pose
 import numpy as np
@@ -32,6 +32,7 @@ def test_basins_of_a_pair_differ_significantly_for_its_matches(seed):
     problem = problem_of(views.x, y)
     basin = choose_basin(problem, views.x, hemisphere_starts(views.R, 12), EstimatorConfig(), None,
                          None)
+    assert basin.rivals
     for one, other in combinations([basin.pose, *basin.rivals], 2):
         residuals = epipolar_residuals(problem, one.R, one.t)
         near = residuals.jacobian[:, np.abs(residuals.r) < 3 * NOISE]
@@ -60,3 +61,15 @@ def test_a_part_of_the_image_shows_that_a_pose_is_a_compromise_of_two_motions(se
     of_all = minimise(world, views.R, views.t, Loss('geman_mcclure', NOISE)).pose
     found = better_by_parts(world, views.x, of_all, EstimatorConfig())
     assert found is None or pose_distance(found, of_all) < 0.002
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_of_a_camera_that_only_turns_no_direction_is_a_rival(seed):
+    """Matches that a rotation explains prefer none, so the choice does not matter."""
+    rng = np.random.default_rng(seed)
+    views = two_views(rng, 200, near=1e5, far=1e6, turn=(0.02, 0.1, -0.03))
+    y = views.y + rng.normal(0, NOISE / 2, views.y.shape)
+    before = PreviousMotion(rotation_exp(np.array([0.01, 0.09, -0.02])), unit(np.array(FORWARD)))
+    basin = choose_predicted_basin(problem_of(views.x, y), views.x, before, EstimatorConfig())
+    assert not basin.rivals
+    assert rotation_angle(basin.pose.R, views.R) < 0.002

@@ -7,6 +7,7 @@ from djet_ros.core.bodies import (
     are_of_one_motion,
     continuing_motion,
     fits_followed_body,
+    is_continued,
     LeftOut,
     of_followed_body,
 )
@@ -235,6 +236,14 @@ def turned_by(degrees: float, claim: float) -> RelativePose:
     return RelativePose(
         Status.OK, rotation_exp(np.radians([0, degrees, 0])), AHEAD,
         own_covariance_5=np.radians(claim)**2 * np.eye(5))
+
+
+def test_a_pair_goes_on_by_a_previous_motion_to_within_three_degrees() -> None:
+    before = Pose(rotation_exp(np.zeros(3)), AHEAD)
+    assert is_continued(before, turned_by(2.0, 0.1))
+    assert not is_continued(before, turned_by(4.0, 0.1))
+    assert not is_continued(Pose(before.R, -AHEAD), turned_by(0.0, 0.1))
+    assert not is_continued(None, turned_by(0.0, 0.1))
 
 
 def test_all_matches_are_of_one_motion_if_their_pose_covers_that_of_the_followed() -> None:
