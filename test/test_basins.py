@@ -5,6 +5,7 @@ from itertools import combinations
 from djet_ros.core.basins import better_by_parts, choose_basin, choose_predicted_basin
 from djet_ros.core.covariance import CHI2_999, pose_difference
 from djet_ros.core.estimator_config import EstimatorConfig
+from djet_ros.core.fusion import MeasuredRotation
 from djet_ros.core.geometry import rays, rotation_angle, rotation_exp, unit
 from djet_ros.core.jet import epipolar_residuals, JetProblem, Loss, minimise
 from djet_ros.core.rivals import pose_distance, PreviousMotion
@@ -73,3 +74,22 @@ def test_of_a_camera_that_only_turns_no_direction_is_a_rival(seed):
     basin = choose_predicted_basin(problem_of(views.x, y), views.x, before, EstimatorConfig())
     assert not basin.rivals
     assert rotation_angle(basin.pose.R, views.R) < 0.002
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_a_measured_rotation_tells_the_camera_from_a_body_with_most_matches(seed):
+    rng = np.random.default_rng(seed)
+    views = two_views(rng, 400, FORWARD)
+    lorry = np.arange(400) % 3 > 0
+    ahead = project(K, views.points @ rotation_exp(np.array([0.01, 0.06, -0.005])).T
+                    + unit(np.array([0.5, 0.0, -1.0])))[0]
+    y = np.where(lorry[:, None], ahead, views.y) + rng.normal(0, NOISE / 5, ahead.shape)
+    problem, starts = problem_of(views.x, y), hemisphere_starts(views.R, 12)
+    alone, by_gyro = (choose_basin(problem, views.x, starts, EstimatorConfig(), None, measured)
+                      for measured in (None, MeasuredRotation(views.R, np.eye(3) * 1e-4**2)))
+    # Without it the pose is that of most matches, or a compromise.
+    assert rotation_angle(alone.pose.R, views.R) > 5e-3
+    assert rotation_angle(by_gyro.pose.R, views.R) < 1e-3
+    assert all(rotation_angle(rival.R, views.R) < 3e-3 for rival in by_gyro.rivals)
+    # The noise is that of the matches, not that of the outliers.
+    assert by_gyro.scale < NOISE
