@@ -72,6 +72,8 @@ def calibrated(K: np.ndarray, f: float = 0.0, cx: float = 0.0, cy: float = 0.0) 
 @pytest.mark.parametrize('t', [SIDEWAYS, FORWARD, BACKWARD])
 def test_a_calibration_error_moves_a_pose_as_its_covariance_predicts(camera, t):
     views, off = two_views(np.random.default_rng(5), t=t, K=camera), 0.5
+    # Gross outliers do not pull it.
+    views.y[::10] += np.random.default_rng(7).normal(0, 200, views.y[::10].shape)
     loss, count = Loss('geman_mcclure', 3.0), len(views.x)
     sharp = np.random.default_rng(6).uniform(0.5, 2, (count, 1, 2)) * np.eye(2)
     surfaces = Paraboloids(views.y, sharp + 0.2, np.zeros((count, 2)), np.zeros(count),
@@ -188,6 +190,19 @@ def test_a_pose_that_depends_on_one_match_is_undetermined():
     J[4, 7], r[7] = 1, 0  # the pose goes where the match wants it, and nothing is left to see
     residuals = Residuals(r, np.ones(300), J, sphere_tangents(t))
     assert np.isnan(pose_covariance(residuals, Loss(), places, t, False)[0]).all()
+
+
+@pytest.mark.parametrize('parts', [1, 2])
+def test_what_one_part_of_the_image_determines_alone_is_undetermined(parts):
+    """However many matches it has: they may all be of one object."""
+    rng, t = np.random.default_rng(4), np.array([0.0, 0, 1])
+    places, J = rng.uniform((0, 0), (1240, 376), (600, 2)), rng.normal(size=(5, 600))
+    places[:200] = rng.uniform(10, 130, (200, 2))
+    places[:200:2] += (900, 200) if parts == 2 else (0, 0)
+    J[4, 200:] = 0
+    residuals = Residuals(rng.normal(size=600), np.ones(600), J, sphere_tangents(t))
+    covariance = pose_covariance(residuals, Loss(), places, t, False)[0]
+    assert np.isfinite(covariance).all() == (parts == 2)
 
 
 @pytest.mark.slow
