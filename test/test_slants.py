@@ -71,6 +71,19 @@ def test_of_all_points_those_beyond_a_depth_edge_do_not_bias_the_rest() -> None:
     assert np.median(np.abs(slopes_of_all(x, rho, 0.01 * rho)) / rho[:, None]) < 1e-3
 
 
+@pytest.mark.parametrize('way', [(1, 0), (-1, 0), (0, 1), (0, -1)])
+def test_what_is_seen_nearly_edge_on_is_fronto_parallel_whichever_way_it_leans(
+        way: tuple[int, int]) -> None:
+    """A patch of it would be that of other points after any motion."""
+    x = np.random.default_rng(6).uniform(100, 116, (300, 2))
+    for lean, taken in ((0.01, True), (0.06, False)):
+        rho = 0.1 * (1 + lean * (x - 108) @ way)
+        for found in (slopes(x, rho, 1e-3 * rho, x), slopes_of_all(x, rho, 1e-3 * rho)):
+            assert found.any(1).mean() > 0.9 if taken else not found.any()
+        # As depths are while the sign of the translation is not known.
+        np.testing.assert_allclose(slopes_of_all(x, -rho, 1e-3 * rho), -found, atol=1e-12)
+
+
 def test_few_or_scattered_points_are_fronto_parallel() -> None:
     x = np.arange(20.0)[:, None] * [200.0, 0.0]
     assert not slopes_of_all(x, np.ones(20), np.full(20, 0.01)).any()
