@@ -26,6 +26,7 @@ from djet_ros.core.geometry import (
     slant_warp,
     sphere_log,
     sphere_tangents,
+    turn_before_plane,
     unit,
 )
 from hypothesis import example, given, strategies as st
@@ -237,6 +238,45 @@ def test_a_rotation_fit_is_exact_and_robust_to_outliers():
     turned[:60] += (0.05, 0.01, 0)  # a lorry passes by
     turned += rng.normal(0, 1e-4, turned.shape)
     assert rotation_angle(fit_rotation(rays_x, turned), seen.R) < 1e-4
+
+
+@pytest.mark.parametrize('translation', [(0, 0, 0), SIDEWAYS, (0, -1, 0.3)])
+def test_a_turn_in_front_of_a_wall_does_not_absorb_a_translation_along_it(translation):
+    rng = np.random.default_rng(5)
+    wall = np.column_stack([rng.uniform(-0.6, 0.6, (200, 2)), np.ones(200)])
+    turn, v = np.array([1e-4, -2e-4, 3e-4]), 1e-3 * np.array(translation)
+    seen = wall @ rotation_exp(turn).T + v
+    # Not of the wall: some nearer points, as a moving arm.
+    seen[:30] += [0.01, 0.02, 0]
+    found, _ = turn_before_plane(wall, seen)
+    # To first order in both, of 1e-3.
+    assert np.abs(found - turn).max() < 1e-6
+    absorbed = np.abs(rotation_log(fit_rotation(wall, seen)) - turn).max()
+    assert absorbed > 3e-4 if any(translation) else absorbed < 1e-5
+
+
+@pytest.mark.parametrize('half_width', [0.05, 0.6])
+def test_a_turn_in_front_of_a_wall_is_as_uncertain_as_it_claims(half_width):
+    rng, noise = np.random.default_rng(6), 1e-4
+    wall = np.column_stack([rng.uniform(-half_width, half_width, 200),
+                            rng.uniform(-0.4, 0.4, 200), np.ones(200)])
+    squares = []
+    for _ in range(200):
+        turn, v = rng.normal(0, 1e-4, (2, 3))
+        seen = wall @ rotation_exp(turn).T + v
+        seen /= seen[:, 2:]
+        seen[:, :2] += rng.normal(0, noise, (200, 2))
+        found, covariance = turn_before_plane(wall, seen)
+        squares.append((found - turn) @ np.linalg.solve(covariance, found - turn))
+    # Its expectation is 3; a robust fit is somewhat less accurate than least squares.
+    assert 2.5 < np.mean(squares) < 4.5
+
+
+def test_a_turn_that_nothing_determines_has_a_covariance():
+    nowhere = np.tile([0.1, 0.2, 1.0], (10, 1))
+    turn, covariance = turn_before_plane(nowhere, nowhere)
+    assert not turn.any()
+    assert 0.1 < np.linalg.eigvalsh(covariance)[-1] <= 1
 
 
 def test_a_rotation_fitted_to_coplanar_rays_is_no_reflection():

@@ -307,7 +307,8 @@ def test_as_pure_rotation_fits_the_rotation_and_widens_the_covariance() -> None:
     assert turn.status is Status.NO_PARALLAX and not turn.t.any()
     assert rotation_angle(turn.R, R) < 1e-4
     off = Rotation.from_matrix(wrong @ R.T).as_rotvec()
-    assert unit(off) @ turn.covariance_5[:3, :3] @ unit(off) > 0.9 * off @ off
+    # Either of the two rotations may be right.
+    assert unit(off) @ turn.covariance_5[:3, :3] @ unit(off) > 0.45 * off @ off
 
 
 def test_the_prior_decides_between_two_motions() -> None:

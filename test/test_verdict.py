@@ -13,6 +13,7 @@ from djet_ros.core.geometry import (
     epipolar_lines,
     fundamental,
     line_distances,
+    rotation_log,
     unit,
 )
 from djet_ros.core.pair import Pair
@@ -23,9 +24,23 @@ from djet_ros.core.verdict import as_decided, as_pure_rotation, verdict, with_le
 from djet_ros.odometry.uncertainty import UNKNOWN_MOTION
 import numpy as np
 import pytest
-from two_view import BACKWARD, FORWARD, K, SIDEWAYS, SIZE, two_views, TwoViews, uniform_view
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+from two_view import (
+    BACKWARD,
+    FORWARD,
+    K,
+    project,
+    SIDEWAYS,
+    SIZE,
+    two_views,
+    TwoViews,
+    uniform_view,
+)
 
 NOISE = 0.2
+
+CHI2_999_OF_ROTATION = chi2.ppf(0.999, 3)
 
 
 def pair_of(x: np.ndarray, y: np.ndarray, start: Pose | None = None) -> Pair:
@@ -81,7 +96,8 @@ def test_a_pure_rotation_may_be_as_wrong_as_the_motion_it_replaces() -> None:
     motion = estimate(pair_of(seen.x, y))
     turn = as_pure_rotation(motion, K)
     off = pose_difference(turn.R, motion.t, Pose(motion.R, motion.t))
-    assert off @ (turn.covariance_5 - motion.covariance_5) @ off == pytest.approx((off @ off)**2)
+    # Or right, if the scene is a plane.
+    assert off @ turn.covariance_5 @ off > (off @ off)**2 / 2
 
 
 def test_the_opposite_motion_is_a_rival_while_its_sign_is_open() -> None:
@@ -138,34 +154,36 @@ def test_matches_that_were_left_out_are_outliers_in_their_places() -> None:
     assert np.median(np.abs(whole.residuals[~kept])) > 3
 
 
-def test_a_rotation_leaves_the_covariance_of_noise_as_it_is() -> None:
-    """Without parallax above the noise the rotation is not biased."""
-    errors = []
+def test_a_rotation_of_noise_is_not_biased() -> None:
     for seed in range(20):
         seen, y = noisy_views(seed, near=1e5, far=1e6)
         turn = estimate(pair_of(seen.x, y))
         assert turn.status is Status.NO_PARALLAX
-        np.testing.assert_array_equal(turn.covariance_5, turn.own_covariance_5)
-        errors.append(pose_difference(turn.R, seen.t, Pose(seen.R, seen.t)))
-    assert np.linalg.norm(errors, axis=1).max() < 5e-4
+        off = pose_difference(turn.R, seen.t, Pose(seen.R, seen.t))[:3]
+        assert np.linalg.norm(off) < 5e-4
+        assert off @ np.linalg.solve(turn.covariance_5[:3, :3], off) < CHI2_999_OF_ROTATION
+        assert np.trace(turn.covariance_5[:3, :3]) < 0.001**2
 
 
-@pytest.mark.parametrize('nearly', [1.0, 0.3])
-def test_what_a_pair_claims_does_not_depend_on_the_order_of_its_rivals(nearly: float) -> None:
-    """An improbable rival widens the covariance, but does not hide an undecided one beside it."""
-    seen, y = noisy_views(7)
-    pair = pair_of(seen.x, y, Pose(seen.R, seen.t))
-    estimator = TwoViewEstimator(EstimatorConfig(method='rpe'))
-    track = track_jointly(pair, ReprojectionSurface(pair.x, y), [Pose(seen.R, seen.t)],
-                          estimator.config)
-    assert track is not None
-    aside = [Pose(seen.R, unit(np.array(seen.t) + angle * np.array([0, 0, 1])))
-             for angle in (1.0, 1.1)]
-    rivals = Rival(aside[0], 3.0), Rival(aside[1], nearly)
-    claims = [verdict(pair, replace(track, rivals=order), estimator.config)
-              for order in (rivals, rivals[::-1])]
-    assert [claim.status for claim in claims] == [Status.AMBIGUOUS] * 2
-    np.testing.assert_array_equal(claims[0].covariance_5, claims[1].covariance_5)
+def test_no_rotation_is_certain_of_what_a_translation_along_a_wall_explains_as_well() -> None:
+    """Seen through a slit they look alike, and the rotation alone absorbs the translation."""
+    rng, within, certain = np.random.default_rng(3), 0, 0
+    for _ in range(40):
+        x = rng.uniform((K[0, 2] - 80, 0), (K[0, 2] + 80, SIZE[1]), (400, 2))
+        wall = np.column_stack([x, np.ones(400)]) @ np.linalg.inv(K).T
+        R = Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix()
+        t = 10**rng.uniform(-3.3, -1.7) * unit(rng.normal(0, (1, 1, 0.1)))
+        y, _ = project(K, wall @ R.T + t)
+        turn = estimate(pair_of(x, y + rng.normal(0, 0.05, y.shape)))
+        assert turn.status is Status.NO_PARALLAX
+        off = rotation_log(turn.R @ R.T)
+        squares = [off @ np.linalg.solve(covariance[:3, :3], off)
+                   for covariance in (turn.covariance_5, turn.own_covariance_5)]
+        within += squares[0] < CHI2_999_OF_ROTATION
+        certain += squares[1] > CHI2_999_OF_ROTATION
+    # As the pose would be, if depths were free.
+    assert certain > 20
+    assert within >= 39
 
 
 def test_a_rival_of_opposite_sign_is_as_uncertain_as_the_one_of_the_nearer_sign() -> None:

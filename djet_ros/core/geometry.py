@@ -13,6 +13,7 @@ from typing import Any
 
 import cv2
 from djet_ros import compiled
+from djet_ros.core.medians import median
 from djet_ros.core.types import Array
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,10 @@ from scipy.spatial.transform import Rotation
 
 # Generators of SO(3), (3, 3, 3): [e_i]_x.
 GENERATORS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1)
+
+# rad^2; of a five-hundredth of a pixel, far below any noise: a unit beside its inverse, times the
+# number of matches, is not lost in rounding.
+_LEAST_SQUARE = 1e-11
 
 # Takes the trace of a rotation (9,), and the vector (3,) of its antisymmetric part.
 _TRACE_AND_VECTOR = np.column_stack([np.eye(3).ravel(), GENERATORS.reshape(3, 9).T / 2])
@@ -162,6 +167,30 @@ def fit_rotation(rays_x: Array, rays_y: Array, rounds: int = 5) -> Array:
         # The median of the squared deviations.
         weights = 1 / (1 + squared / max(float(np.partition(squared, half)[half]), 1e-18))
     return R
+
+
+def turn_before_plane(rays_x: Array, rays_y: Array, rounds: int = 5) -> tuple[Array, Array]:
+    """
+    Return the rotation vector (3,) of a small motion in front of a plane, and its covariance.
+
+    The plane faces the camera. Rays X = (x, y, 1) move by w x X + v, with the translation v in
+    units of the depth of the plane, which is linear in w and v (Longuet-Higgins and Prazdny,
+    1980). What the image does not determine is less than one radian, and one depth. Robust as
+    `fit_rotation`. rays_x, rays_y: (N, 3), nearly the same.
+    """
+    (x, y), seen = ((rays[:, :2] / rays[:, 2:]).T for rays in (rays_x, rays_y))
+    one, none = np.ones_like(x), np.zeros_like(x)
+    J = np.concatenate([[-x * y, 1 + x * x, -y, one, none, -x],
+                        [-1 - y * y, x * y, x, none, one, -y]], axis=1)
+    offsets, motion = (seen - [x, y]).ravel(), np.zeros(6)
+    for _ in range(rounds):
+        squared = ((offsets - motion @ J)**2).reshape(2, -1).sum(0)
+        half = max(median(squared), _LEAST_SQUARE)
+        weighted = J * np.tile(1 / (half + squared), 2)
+        motion = np.linalg.solve(weighted @ J.T + np.eye(6), weighted @ offsets)
+    # Half of the squared lengths of normal errors are below 2 ln 2 variances.
+    information = 2 * np.log(2) / half * J @ J.T + np.eye(6)
+    return motion[:3], np.asarray(np.linalg.inv(information)[:3, :3])
 
 
 def nearest_rotation(M: Array) -> Array:

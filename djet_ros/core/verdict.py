@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 from djet_ros.core.algorithm import ALGORITHM_TUNING, Track
 from djet_ros.core.covariance import (
@@ -27,6 +27,7 @@ from djet_ros.core.geometry import (
     norms,
     rays,
     rotation_log,
+    turn_before_plane,
 )
 from djet_ros.core.hamming import match_distances
 from djet_ros.core.jet import epipolar_residuals
@@ -92,11 +93,10 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
         status, t = Status.DEGENERATE, np.zeros(3)
     elif _false_alarm(pair, track, count, config):
         status = Status.TOO_FEW_INLIERS
-    elif (pure_rotation := _rotation_alone(K, rays_x, rays_y, y, track.scale, config)) is not None:
+    elif (rotation := _rotation_alone(K, rays_x, rays_y, y, track.scale, config)) is not None:
         # t is not determined.
-        status, R, t = Status.NO_PARALLAX, pure_rotation.R, np.zeros(3)
-        if pure_rotation.is_biased:
-            covariance = _widened_by_rotation(covariance, pose.R, R)
+        status, R, t = Status.NO_PARALLAX, rotation, np.zeros(3)
+        covariance = _of_rotation_alone(covariance, pose.R, R, rays_x, rays_y)
     else:
         status, covariance, rivals = _compare_with_rivals(
             pose, covariance, track, pair.x, pair.prior, sign_open)
@@ -172,20 +172,36 @@ def as_pure_rotation(relative: RelativePose, K: Array) -> RelativePose:
     """
     Return a pair without parallax as a pure rotation (status NO_PARALLAX).
 
-    The covariance is widened by the change of the rotation.
+    The covariance is that of `_of_rotation_alone`.
     """
-    agree = relative.inliers
-    R = fit_rotation(rays(K, relative.x[agree]), rays(K, relative.placed[agree]))
-    covariance = _widened_by_rotation(relative.covariance_5, relative.R, R)
+    rays_x, rays_y = (rays(K, places[relative.inliers])
+                      for places in (relative.x, relative.placed))
+    R = fit_rotation(rays_x, rays_y)
+    covariance = _of_rotation_alone(relative.covariance_5, relative.R, R, rays_x, rays_y)
     lines = epipolar_lines(fundamental(K, R, relative.t), relative.x)
     return replace(relative, status=Status.NO_PARALLAX, R=R, t=np.zeros(3),
                    residuals=line_distances(lines, relative.y), covariance_5=covariance,
                    covariance_6=lifted_covariance(covariance, relative.t))
 
 
-def _widened_by_rotation(covariance: Array, R: Array, rotation: Array) -> Array:
-    """Widen a covariance (5, 5) by the difference of a rotation R from a pure rotation (3, 3)."""
-    return widened_to_span(covariance, np.append(rotation_log(rotation @ R.T), [0.0, 0.0]), 1.0)
+def _of_rotation_alone(covariance: Array, R: Array, alone: Array, rays_x: Array, rays_y: Array
+                       ) -> Array:
+    """
+    Return the covariance (5, 5) of a pose if its rotation R is replaced by a rotation alone.
+
+    That absorbs a translation along a surface, the more the narrower the image, as long as both
+    look alike to within the noise. So its expected squared error is the mean of those by two
+    motions with a translation, of which either may be right: the pose, and the motion in front of
+    a plane. (A pose may be of the wrong basin: without parallax, its t may be any.)
+
+    covariance: (5, 5) of the pose; alone: (3, 3); rays_x, rays_y: (N, 3).
+    """
+    turn, of_turn = turn_before_plane(rays_x @ alone.T, rays_y)
+    before_plane = covariance.copy()
+    before_plane[:3, 3:], before_plane[3:, :3] = 0.0, 0.0
+    before_plane[:3, :3] = of_turn + np.outer(turn, turn)
+    off = np.append(rotation_log(alone @ R.T), [0.0, 0.0])
+    return (widened_to_span(covariance, off, 1.0) + before_plane) / 2
 
 
 def _sign(pose: Pose, rays_x: Array, rays_y: Array, x: Array,
@@ -316,24 +332,15 @@ def _random_descriptors(hamming: Array) -> bool:
     return bool(known.size and median(known) > _RANDOM_BITS)
 
 
-class _PureRotation(NamedTuple):
-    """A rotation (3, 3), and whether a translation biases it by more than the noise."""
-
-    R: Array
-    is_biased: bool
-
-
 def _rotation_alone(K: Array, rays_x: Array, rays_y: Array, y: Array, noise: float,
-                    config: EstimatorConfig) -> _PureRotation | None:
+                    config: EstimatorConfig) -> Array | None:
     """
     Return the rotation that alone explains the inliers; None if their parallax is too large.
 
     rays_x, rays_y: (N, 3); y: (N, 2) pixels of the latter; noise: standard deviation in pixels.
-    Parallax above the noise is real, and the rotation is biased to compensate for it.
     """
-    R, noise = fit_rotation(rays_x, rays_y), _PARALLAX_OVER_NOISE * noise
+    R = fit_rotation(rays_x, rays_y)
     rotated = rays_x @ (K @ R).T
     # The upper quartile.
     parallax = quantile(norms(y - rotated[:, :2] / rotated[:, 2:]), 0.75)
-    explained = parallax < max(config.min_parallax, noise)
-    return _PureRotation(R, parallax >= noise) if explained else None
+    return R if parallax < max(config.min_parallax, _PARALLAX_OVER_NOISE * noise) else None
