@@ -40,8 +40,13 @@ def run(*command: str | Path, cwd: Path) -> str:
 
 @pytest.fixture(scope='module', autouse=True)
 def unoptimised(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Compile without optimisation, which would take most of the time of each build."""
+    """
+    Compile without optimisation, which would take most of the time of each build.
+
+    Without PYTHONPATH, as its packages are found before those that are installed here.
+    """
     with pytest.MonkeyPatch.context() as patch:
+        patch.delenv('PYTHONPATH', raising=False)
         if compiler := shutil.which('cc'):
             script = tmp_path_factory.mktemp('compiler') / 'cc'
             # The last level counts.
