@@ -10,7 +10,7 @@ from typing import Any
 from djet_ros.core.types import Status
 from djet_ros.lab import plots
 from djet_ros.lab.pairs import PairRecord
-from djet_ros.lab.style import figure
+from djet_ros.lab.style import figure, legend_below
 from djet_ros.replay.results import plot_trajectory
 from matplotlib.figure import Figure
 import numpy as np
@@ -34,6 +34,24 @@ def test_errors_far_below_those_of_a_dataset_are_drawn_where_they_are(
     # A logarithmic axis has no zero, and an unknown error no place.
     assert np.allclose(above, [2e-5, 1e-6, np.nan, 0.03], equal_nan=True, rtol=1e-12)
     assert np.allclose(below, [2e-4, 1e-6, np.nan, 0.3], equal_nan=True, rtol=1e-12)
+
+
+@pytest.mark.parametrize('methods', [1, 9])
+def test_a_legend_lies_below_all_axes_and_inside_the_figure(tmp_path: Path, methods: int) -> None:
+    """Matplotlib's own place for that, 'outside', came with 3.7; Ubuntu 24.04 has 3.6."""
+    with figure(tmp_path / 'plot.png', 9, 4) as drawn:
+        panels = drawn.subplots(1, 2)
+        for axes in panels:
+            axes.set_xlabel('frame')
+            for method in range(methods):
+                axes.plot([0, 1], label=f'method {method}')
+        legend_below(drawn, panels[1])
+    legend, = drawn.legends
+    place = legend.get_window_extent()
+    assert len(legend.get_texts()) == methods
+    assert place.y0 >= 0
+    assert all(axes.get_tightbbox().y0 >= place.y1 for axes in panels)
+    assert all(axes.get_tightbbox().y0 < place.y1 + 10 for axes in panels)
 
 
 def kept(drawn: dict[str, Figure]) -> Any:

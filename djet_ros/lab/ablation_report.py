@@ -14,7 +14,7 @@ from djet_ros.lab.pairs import PairRecord
 from djet_ros.lab.published import TABLE_2
 from djet_ros.lab.report import CAPTION, Picture, write_page
 from djet_ros.lab.sequences import Dataset
-from djet_ros.lab.style import COLOURS, figure
+from djet_ros.lab.style import COLOURS, figure, legend_below
 from djet_ros.lab.summary import table_rows, TableRow
 from djet_ros.lab.tables import (
     ablation_table,
@@ -103,8 +103,7 @@ def plot_ablation(path: Path, title: str, rows: Sequence[TableRow]) -> None:
             line[0].set_title(f'preset {preset}', loc='left')
         for axes, kind in zip(panels[-1], ('rotation', 'translation')):
             axes.set_xlabel(f'{kind} error, deg')
-        handles, labels = panels[0, 0].get_legend_handles_labels()
-        drawing.legend(handles, labels, loc='outside lower center', ncols=len(labels))
+        legend_below(drawing, panels[0, 0])
 
 
 def _changes(rows: Sequence[TableRow]) -> list[str]:

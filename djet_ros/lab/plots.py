@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from djet_ros.lab.integration import StampedTrajectory
 from djet_ros.lab.methods import TITLES
 from djet_ros.lab.pairs import GROSS_ROTATION, GROSS_TRANSLATION, PairRecord
-from djet_ros.lab.style import COLOURS, DASHES, figure
+from djet_ros.lab.style import COLOURS, DASHES, figure, legend_below
 from matplotlib.axes import Axes
 import numpy as np
 
@@ -92,7 +91,7 @@ def plot_trajectories(path: Path, title: str, truth: StampedTrajectory,
             axes.set_xlabel('x (right), m')
             axes.set_aspect('equal', adjustable='datalim')
         panels[0].set_ylabel('z (forward), m')
-        _legend(drawing, panels[-1])
+        legend_below(drawing, panels[-1])
 
 
 def _panels(path: Path, title: str, groups: Groups,
@@ -114,12 +113,7 @@ def _panels(path: Path, title: str, groups: Groups,
             if share_y:
                 row[0].set_ylabel(label)
         if legend:
-            _legend(drawing, panels[0, -1])
-
-
-def _legend(drawing: Any, axes: Axes) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    drawing.legend(handles, labels, loc='outside lower center', ncols=min(len(labels), 8))
+            legend_below(drawing, panels[0, -1])
 
 
 def _errors(records: Sequence[PairRecord], kind: str) -> list[float]:

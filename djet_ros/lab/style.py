@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from djet_ros.recordings.outputs import replaced_whole
 from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, LogFormatterMathtext
 
@@ -56,6 +57,15 @@ def figure(path: Path, width: float, height: float) -> Iterator[Figure]:
         _label_logarithms(empty)
         with replaced_whole(path) as new:
             empty.savefig(new, dpi=120)
+
+
+def legend_below(drawing: Figure, axes: Axes) -> None:
+    """Add a legend of what some axes show, below all axes of a figure of `figure`."""
+    handles, labels = axes.get_legend_handles_labels()
+    # Matplotlib 3.6, which Ubuntu 24.04 has, cannot place it outside the axes by itself.
+    legend = drawing.legend(handles, labels, loc='lower center', ncols=min(len(labels), 8))
+    share = legend.get_window_extent().y1 / drawing.bbox.height
+    drawing.set_layout_engine('constrained', rect=(0, share, 1, 1 - share))
 
 
 class _Decimal(LogFormatter):
