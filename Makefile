@@ -18,6 +18,8 @@ BUILT := setup.py $(wildcard djet_ros/compiled/*.[ch])
 WORKERS ?= $(shell expr $$(nproc 2>/dev/null || getconf _NPROCESSORS_ONLN) + 1)
 # in the order of their names: files of few tests, some of them long, would come last
 PYTEST := python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+# also where an older version is installed
+NEWEST := pip install --quiet --upgrade --upgrade-strategy eager --editable
 
 # the first that is there, works (a pyenv shim may not) and is new enough
 PYTHON ?= $(shell for python in python3.12 python3.11 python3.13 python3; do \
@@ -56,9 +58,13 @@ lowest-libraries: $(LOWEST)/.libraries
 fuzz: $(VENV)/.installed-fuzz
 	$(VENV)/bin/python test/fuzz.py --seconds $(FUZZ_SECONDS)
 
-# known vulnerabilities in the newest versions that setup.py allows, the extras' too
-audit: $(AUDIT)/.installed
+# known vulnerabilities in the newest versions that setup.py allows, the extras' too; apart those
+# that slam allows, whose GTSAM needs NumPy 1 and with it an older OpenCV
+audit: $(AUDIT)/bin/pip $(AUDIT)-slam/bin/pip
+	$(AUDIT)/bin/$(NEWEST) '.[audit,cluster,dds,peers]'
 	$(AUDIT)/bin/python .ci/audit.py
+	$(AUDIT)-slam/bin/$(NEWEST) '.[audit,slam]'
+	$(AUDIT)-slam/bin/python .ci/audit.py
 
 # the figures of doc/results.md and the README's table; a broken run is taken up where it ended;
 # ONLY adds parts to what the same settings and code gave
@@ -78,7 +84,7 @@ pages: $(TOOLS)
 	$(VENV)/bin/python doc/pages.py
 
 clean:
-	rm -rf $(VENV) $(LOWEST) $(AUDIT) build demo fuzz *.egg-info djet_ros/compiled/*.so
+	rm -rf $(VENV) $(LOWEST) $(AUDIT) $(AUDIT)-slam build demo fuzz *.egg-info djet_ros/compiled/*.so
 
 $(VENV)/.installed: $(BUILT) | $(VENV)/bin/pip
 	$(VENV)/bin/pip install --quiet --editable .
@@ -87,10 +93,6 @@ $(VENV)/.installed: $(BUILT) | $(VENV)/bin/pip
 # Python compiles what the tests import as they do, a fifth of what is installed.
 $(VENV)/.installed-%: $(BUILT) | $(VENV)/bin/pip
 	$(VENV)/bin/pip install --quiet --no-compile --editable '.[$*]'
-	touch $@
-
-$(AUDIT)/.installed: setup.py | $(AUDIT)/bin/pip
-	$(AUDIT)/bin/pip install --quiet --editable '.[audit,cluster,dds,peers,slam]'
 	touch $@
 
 $(LOWEST)/.libraries: test/lowest.txt | $(LOWEST)/bin/pip

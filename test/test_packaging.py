@@ -252,6 +252,20 @@ def test_the_pages_list_every_dependency_with_its_bounds(distribution: Distribut
     assert listed == needed
 
 
+@pytest.mark.skipif(shutil.which('make') is None, reason='no make')
+def test_the_audit_is_of_the_newest_versions_that_each_extra_allows(
+        distribution: Distribution) -> None:
+    commands = run('make', '--dry-run', 'audit', cwd=ROOT).splitlines()
+    installed = [line for line in commands if 'pip install' in line]
+    assert all('--upgrade --upgrade-strategy eager' in line for line in installed)
+    extras = [set(re.search(r'\[(.+)\]', line)[1].split(',')) for line in installed]
+    ours = {'fuzz', 'lint', 'test'}
+    assert set.union(*extras) == {*distribution.metadata.get_all('Provides-Extra')} - ours
+    # GTSAM 4.2 holds back NumPy, and that OpenCV.
+    assert [one for one in extras if 'slam' in one] == [{'audit', 'slam'}]
+    assert sum('.ci/audit.py' in line for line in commands) == len(extras)
+
+
 def test_the_audit_fails_for_a_package_without_information(tmp_path: Path) -> None:
     answers = {'clean': '{"dependencies": [{"name": "a", "version": "1", "vulns": []}]}',
                'unknown': '{"dependencies": [{"name": "a", "skip_reason": "not found"}]}',
