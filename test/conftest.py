@@ -3,6 +3,7 @@
 from collections.abc import Callable
 import os
 from pathlib import Path
+import signal
 
 from djet_ros.threads import one_blas_thread
 import pytest
@@ -11,8 +12,11 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def pytest_configure() -> None:
-    """Use one thread a process, set before NumPy is imported: tests run in parallel."""
+    """Use one thread a process, set before NumPy is imported, and let SIGINT end commands."""
     one_blas_thread()
+    # A shell's background job ignores SIGINT, and so would the commands that tests interrupt.
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     from hypothesis import settings
     # Hypothesis' deadline of 200 ms an example is missed where others use the cores too.
     settings.register_profile('no deadline', deadline=None)
