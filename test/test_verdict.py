@@ -186,6 +186,24 @@ def test_no_rotation_is_certain_of_what_a_translation_along_a_wall_explains_as_w
     assert within >= 39
 
 
+@pytest.mark.parametrize('nearly', [1.0, 0.3])
+def test_what_a_pair_claims_does_not_depend_on_the_order_of_its_rivals(nearly: float) -> None:
+    """An improbable rival widens the covariance, but does not hide an undecided one beside it."""
+    seen, y = noisy_views(7)
+    pair = pair_of(seen.x, y, Pose(seen.R, seen.t))
+    estimator = TwoViewEstimator(EstimatorConfig(method='rpe'))
+    track = track_jointly(pair, ReprojectionSurface(pair.x, y), [Pose(seen.R, seen.t)],
+                          estimator.config)
+    assert track is not None
+    aside = [Pose(seen.R, unit(np.array(seen.t) + angle * np.array([0, 0, 1])))
+             for angle in (1.0, 1.1)]
+    rivals = Rival(aside[0], 3.0), Rival(aside[1], nearly)
+    claims = [verdict(pair, replace(track, rivals=order), estimator.config)
+              for order in (rivals, rivals[::-1])]
+    assert [claim.status for claim in claims] == [Status.AMBIGUOUS] * 2
+    np.testing.assert_array_equal(claims[0].covariance_5, claims[1].covariance_5)
+
+
 def test_a_rival_of_opposite_sign_is_as_uncertain_as_the_one_of_the_nearer_sign() -> None:
     seen, y = noisy_views(8)
     pair = pair_of(seen.x, y, Pose(seen.R, seen.t))
