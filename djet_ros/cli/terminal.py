@@ -7,6 +7,7 @@ from contextlib import contextmanager, nullcontext
 import os
 import sys
 
+from djet_ros.errors import one_line
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import (
@@ -20,7 +21,6 @@ from rich.progress import (
 )
 from rich.table import Table
 from rich.text import Text
-
 
 # Width in characters of tables written to a file or a pipe, wide enough to truncate nothing.
 _FILE_WIDTH = 200
@@ -38,8 +38,8 @@ def console() -> Console:
 
 
 def warn(line: str) -> None:
-    """Print a warning of one line on stderr."""
-    print(f'djet: warning: {line}', file=sys.stderr)
+    """Print a warning of one line on stderr; names that a bag has in it control no terminal."""
+    print(f'djet: warning: {one_line(line)}', file=sys.stderr)
 
 
 class _Rate(ProgressColumn):
