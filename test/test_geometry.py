@@ -240,12 +240,14 @@ def test_a_rotation_fit_is_exact_and_robust_to_outliers():
     assert rotation_angle(fit_rotation(rays_x, turned), seen.R) < 1e-4
 
 
+@pytest.mark.parametrize('slope', [0.0, 0.2, -0.5])
 @pytest.mark.parametrize('translation', [(0, 0, 0), SIDEWAYS, (0, -1, 0.3)])
-def test_a_turn_in_front_of_a_wall_does_not_absorb_a_translation_along_it(translation):
+def test_a_turn_in_front_of_a_wall_does_not_absorb_a_translation_along_it(translation, slope):
     rng = np.random.default_rng(5)
     wall = np.column_stack([rng.uniform(-0.6, 0.6, (200, 2)), np.ones(200)])
     turn, v = np.array([1e-4, -2e-4, 3e-4]), 1e-3 * np.array(translation)
-    seen = wall @ rotation_exp(turn).T + v
+    # Seen askew, one side of the wall is nearer than the other.
+    seen = wall @ rotation_exp(turn).T + (1 + slope * wall[:, :1]) * v
     # Not of the wall: some nearer points, as a moving arm.
     seen[:30] += [0.01, 0.02, 0]
     found, _ = turn_before_plane(wall, seen)
@@ -255,15 +257,16 @@ def test_a_turn_in_front_of_a_wall_does_not_absorb_a_translation_along_it(transl
     assert absorbed > 3e-4 if any(translation) else absorbed < 1e-5
 
 
-@pytest.mark.parametrize('half_width', [0.05, 0.6])
-def test_a_turn_in_front_of_a_wall_is_as_uncertain_as_it_claims(half_width):
+@pytest.mark.parametrize(('half_width', 'slope', 'shift'), [
+    (0.05, 0.0, 1e-4), (0.6, 0.0, 1e-4), (0.6, 0.2, 1e-3)])
+def test_a_turn_in_front_of_a_wall_is_as_uncertain_as_it_claims(half_width, slope, shift):
     rng, noise = np.random.default_rng(6), 1e-4
     wall = np.column_stack([rng.uniform(-half_width, half_width, 200),
                             rng.uniform(-0.4, 0.4, 200), np.ones(200)])
     squares = []
     for _ in range(200):
-        turn, v = rng.normal(0, 1e-4, (2, 3))
-        seen = wall @ rotation_exp(turn).T + v
+        turn, v = rng.normal(0, 1, (2, 3)) * [[1e-4], [shift]]
+        seen = wall @ rotation_exp(turn).T + (1 + slope * wall[:, :1]) * v
         seen /= seen[:, 2:]
         seen[:, :2] += rng.normal(0, noise, (200, 2))
         found, covariance = turn_before_plane(wall, seen)

@@ -186,6 +186,21 @@ def test_no_rotation_is_certain_of_what_a_translation_along_a_wall_explains_as_w
     assert within >= 39
 
 
+@pytest.mark.parametrize('slope', [0.0, 0.2, 0.5])
+def test_nor_if_the_wall_is_seen_askew(slope: float) -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(40):
+        x = rng.uniform((0, 0), SIZE, (400, 2))
+        wall = np.column_stack([x, np.ones(400)]) @ np.linalg.inv(K).T
+        wall /= 1 + slope * wall[:, :1]
+        R = Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix()
+        y, _ = project(K, wall @ R.T + 0.001 * unit(rng.normal(0, (1, 1, 0.1))))
+        turn = estimate(pair_of(x, y + rng.normal(0, 0.05, y.shape)))
+        assert turn.status is Status.NO_PARALLAX
+        off = rotation_log(turn.R @ R.T)
+        assert off @ np.linalg.solve(turn.covariance_5[:3, :3], off) < CHI2_999_OF_ROTATION
+
+
 @pytest.mark.parametrize('nearly', [1.0, 0.3])
 def test_what_a_pair_claims_does_not_depend_on_the_order_of_its_rivals(nearly: float) -> None:
     """An improbable rival widens the covariance, but does not hide an undecided one beside it."""

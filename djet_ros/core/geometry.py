@@ -173,24 +173,31 @@ def turn_before_plane(rays_x: Array, rays_y: Array, rounds: int = 5) -> tuple[Ar
     """
     Return the rotation vector (3,) of a small motion in front of a plane, and its covariance.
 
-    The plane faces the camera. Rays X = (x, y, 1) move by w x X + v, with the translation v in
-    units of the depth of the plane, which is linear in w and v (Longuet-Higgins and Prazdny,
-    1980). What the image does not determine is less than one radian, and one depth. Robust as
-    `fit_rotation`. rays_x, rays_y: (N, 3), nearly the same.
+    Rays X = (x, y, 1) move by w x X + (1 + a x + b y) v: v is the translation in units of the
+    depth of the plane straight ahead, which leans by the slopes a and b (Longuet-Higgins and
+    Prazdny, 1980). What the image does not determine is less than one radian, one depth, and a
+    slope of one. Robust as `fit_rotation`. rays_x, rays_y: (N, 3), nearly the same.
     """
     (x, y), seen = ((rays[:, :2] / rays[:, 2:]).T for rays in (rays_x, rays_y))
     one, none = np.ones_like(x), np.zeros_like(x)
-    J = np.concatenate([[-x * y, 1 + x * x, -y, one, none, -x],
-                        [-1 - y * y, x * y, x, none, one, -y]], axis=1)
-    offsets, motion = (seen - [x, y]).ravel(), np.zeros(6)
+    by_turn = np.concatenate([[-x * y, 1 + x * x, -y], [-1 - y * y, x * y, x]], axis=1)
+    by_shift = np.concatenate([[one, none, -x], [none, one, -y]], axis=1)
+    xy, offsets = np.tile([x, y], 2), (seen - [x, y]).ravel()
+    w, v, slopes = np.zeros(3), np.zeros(3), np.zeros(2)
     for _ in range(rounds):
-        squared = ((offsets - motion @ J)**2).reshape(2, -1).sum(0)
+        # Gauss-Newton: the motion of the plane is linear in w and v, and in its slopes.
+        inverse_depths, shifts = 1 + slopes @ xy, v @ by_shift
+        J = np.concatenate([by_turn, by_shift * inverse_depths, shifts * xy])
+        residuals = offsets - w @ by_turn - shifts * inverse_depths
+        squared = (residuals**2).reshape(2, -1).sum(0)
         half = max(median(squared), _LEAST_SQUARE)
         weighted = J * np.tile(1 / (half + squared), 2)
-        motion = np.linalg.solve(weighted @ J.T + np.eye(6), weighted @ offsets)
+        motion = np.concatenate([w, v, slopes])
+        motion += np.linalg.solve(weighted @ J.T + np.eye(8), weighted @ residuals - motion)
+        w, v, slopes = np.split(motion, (3, 6))
     # Half of the squared lengths of normal errors are below 2 ln 2 variances.
-    information = 2 * np.log(2) / half * J @ J.T + np.eye(6)
-    return motion[:3], np.asarray(np.linalg.inv(information)[:3, :3])
+    information = 2 * np.log(2) / half * J @ J.T + np.eye(8)
+    return w, np.asarray(np.linalg.inv(information)[:3, :3])
 
 
 def nearest_rotation(M: Array) -> Array:
