@@ -17,6 +17,12 @@ def _without_slashes(config: OdometryConfig | SlamConfig, *frames: str) -> None:
         object.__setattr__(config, frame, getattr(config, frame).lstrip('/'))
 
 
+def _require_name(config: OdometryConfig | SlamConfig, frame: str) -> None:
+    """Raise ValueError if a frame without which nothing is published has no name."""
+    if not getattr(config, frame):
+        raise ValueError(f"{frame} is ''; name a frame")
+
+
 def _words(numbers: str) -> list[str]:
     """Split a string of several numbers, with or without list brackets and commas."""
     return numbers.strip().removeprefix('[').removesuffix(']').replace(',', ' ').split()
@@ -119,8 +125,7 @@ class OdometryConfig:
         """Refuse values outside their described range."""
         check(self)
         _without_slashes(self, 'guess_frame', 'camera_frame', 'odom_frame', 'base_frame')
-        if not self.odom_frame:
-            raise ValueError("odom_frame is ''; name a frame")
+        _require_name(self, 'odom_frame')
         self.imu_quaternion()
         self.gray_limits()
 
@@ -216,8 +221,7 @@ class SlamConfig:
         """Refuse values outside their described range."""
         check(self)
         _without_slashes(self, 'map_frame')
-        if not self.map_frame:
-            raise ValueError("map_frame is ''; name a frame")
+        _require_name(self, 'map_frame')
 
 
 @dataclass(frozen=True)

@@ -189,13 +189,22 @@ def _loss_curvature(H: Array, curvature: Array) -> Array | None:
     A robust loss curves less than its weights say (Huber, Robust Statistics, section 7.6), most of
     all in a direction that uncertain matches determine. None if the curvature is not positive.
     """
-    root = np.linalg.cholesky(H)
+    root = np.asarray(np.linalg.cholesky(H))
+    shares, at_least = _with_least(LEAST_CURVATURE, root, curvature)
+    return at_least if shares.sum() > 0 else None
+
+
+def _with_least(share: float, root: Array, matrix: Array) -> tuple[Array, Array]:
+    """
+    Return the shares (5,) of a matrix in another, and it with none of them below a least one.
+
+    root: (5, 5), a square root C of the other one, C C^T; the shares are eigenvalues of the
+    matrix whitened by it.
+    """
     inverse = np.linalg.inv(root)
-    shares, axes = np.linalg.eigh(inverse @ curvature @ inverse.T)
-    if shares.sum() <= 0:
-        return None
+    shares, axes = np.linalg.eigh(inverse @ matrix @ inverse.T)
     half = root @ axes
-    return np.asarray((half * np.maximum(shares, LEAST_CURVATURE)) @ half.T)
+    return shares, np.asarray((half * np.maximum(shares, share)) @ half.T)
 
 
 @dataclass(frozen=True)
@@ -378,12 +387,8 @@ def _at_least(share: float, independent: Array, covariance: Array) -> Array:
     """Return a covariance (5, 5), in no direction below a share of the independent one."""
     variances, axes = np.linalg.eigh(independent)
     root = axes * np.sqrt(np.maximum(variances, 1e-14 * variances[-1]))
-    inverse = np.linalg.inv(root)
-    shares, axes = np.linalg.eigh(inverse @ covariance @ inverse.T)
-    if shares[0] >= share:
-        return covariance
-    half = root @ axes
-    return np.asarray((half * np.maximum(shares, share)) @ half.T)
+    shares, at_least = _with_least(share, root, covariance)
+    return covariance if shares[0] >= share else at_least
 
 
 def _weighted_sum(shares: Array, parts: Array) -> Array:

@@ -37,8 +37,7 @@ class PoseTrack:
             return
         # First, as a bag that loops repeats its stamps.
         self.go_back(stamp_ns)
-        if stamp_ns not in self._poses:
-            self._poses.add(stamp_ns, pose)
+        self._poses.add(stamp_ns, pose)
 
     def covers(self, stamp_ns: int) -> bool:
         """Return whether there is a pose at a stamp, or after it."""

@@ -229,8 +229,7 @@ class SpeedScale(ScaleSource):
             return
         # First, as a bag that loops repeats its stamps.
         self.go_back(stamp_ns)
-        if stamp_ns not in self._speeds:
-            self._speeds.add(stamp_ns, abs(float(metres_per_second)))
+        self._speeds.add(stamp_ns, abs(float(metres_per_second)))
 
     def between(self, start_ns: int, end_ns: int) -> Length:
         """Integrate the speed from start to end."""

@@ -37,7 +37,9 @@ class Stamped(Generic[Value]):
         return bool(self.stamps) and stamp_ns < self.stamps[-1] - _BACK_NS
 
     def add(self, stamp_ns: int, value: Value) -> None:
-        """Take a value with a stamp that has none yet."""
+        """Take a value; a second one with the same stamp is ignored."""
+        if stamp_ns in self._values:
+            return
         insort(self.stamps, stamp_ns)
         self._values[stamp_ns] = value
         if len(self.stamps) > self._kept:
