@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import cv2
-from djet_ros.core.correction import AS_CALIBRATED, Correction, displacements, motion_shift
-from djet_ros.core.geometry import rays, rotation_exp, rotation_log, sphere_log, unit
+from djet_ros.core.correction import (
+    AS_CALIBRATED,
+    Correction,
+    displacements,
+    motion_shift,
+    turn_of_deviating_camera,
+)
+from djet_ros.core.geometry import fit_rotation, rays, rotation_exp, rotation_log, sphere_log, unit
 from djet_ros.core.types import RelativePose, Status
 import numpy as np
 from numpy.typing import NDArray
@@ -54,3 +60,26 @@ def test_a_pair_is_off_by_what_least_squares_makes_of_a_wrong_camera(field: int)
     # A correction of the camera would take that back.
     assert motion_shift(pair, K) @ wrong == pytest.approx(-off, rel=0.05,
                                                           abs=0.03 * np.abs(off).max())
+
+
+@pytest.mark.parametrize('wrong', [Correction(k1=0.01), Correction(focal=0.01),
+                                   Correction(-0.004, 0.005, -0.003, 0.002)])
+def test_a_rotation_is_right_though_the_camera_is_not(wrong: Correction) -> None:
+    places = rays(K, np.random.default_rng(2).uniform((20, 20), (1200, 340), (400, 2)))
+    R = rotation_exp(np.array([0.01, -0.05, 0.004]))
+    x, y = (rays(K, seen(points, wrong)) for points in (places, places @ R.T))
+    found, left = turn_of_deviating_camera(x, y, np.full(4, 0.01))
+    assert left.max() * 700 < 0.02
+    off, off_alone = (np.linalg.norm(rotation_log(one @ R.T)) for one in
+                      (found, fit_rotation(x, y)))
+    assert off < 0.1 * off_alone
+
+
+def test_what_parallax_displaces_is_left_of_it() -> None:
+    """Points in a room, and a step that moves them all by ten pixels to the left, more or less."""
+    rng = np.random.default_rng(3)
+    depths = rng.uniform(0.7, 1.4, (400, 1))
+    places = depths * rays(K, rng.uniform((20, 20), (1200, 340), (400, 2)))
+    x, y = (rays(K, seen(points, AS_CALIBRATED)) for points in (places, places - [0.014, 0, 0]))
+    _, left = turn_of_deviating_camera(x, y, np.full(4, 0.01))
+    assert np.median(left) * 700 > 1

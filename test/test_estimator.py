@@ -18,6 +18,7 @@ from djet_ros.core.estimator_config import EstimatorConfig, METHODS, preset
 from djet_ros.core.geometry import (
     direction_angle,
     epipolar_lines,
+    fit_rotation,
     fundamental,
     in_front,
     line_distances,
@@ -30,6 +31,7 @@ from djet_ros.core.geometry import (
 from djet_ros.core.hamming import dense_descriptors
 from djet_ros.core.jet import robust_scale
 from djet_ros.core.pair import Limits, Pair
+from djet_ros.core.radial import distort
 from djet_ros.core.rivals import PreviousMotion
 from djet_ros.core.starts import five_point, KnownMotion, likely_starts, planar_starts
 from djet_ros.core.surfaces import DescriptorSurface
@@ -236,16 +238,32 @@ def test_pure_rotation_is_distinguished_from_translation():
 
 
 @pytest.mark.parametrize('seed', range(5))
-def test_a_rotation_that_absorbs_little_parallax_has_a_wider_covariance(seed):
+def test_with_little_but_clear_parallax_the_rotation_is_that_of_the_pose(seed):
     seen = two_views(np.random.default_rng(seed), count=500, near=500, far=1500)
     y = seen.y + np.random.default_rng(seed + 50).normal(0, 0.03, seen.y.shape)
     result = TwoViewEstimator(EstimatorConfig(method='rpe')).estimate_matched(
         uniform_view(), uniform_view(), seen.x, y)
-    assert result.status == Status.NO_PARALLAX
+    assert result.status == Status.NO_PARALLAX and not result.t.any()
+    # All points move to one side by half a pixel and more, which a rotation alone would absorb.
+    alone = fit_rotation(rays(K, seen.x), rays(K, y))
+    assert np.linalg.norm(rotation_log(seen.R @ alone.T)) > 0.5 / 700
     off = rotation_log(seen.R @ result.R.T)
-    # All points move to one side by half a pixel and more, which a rotation explains as well.
-    assert np.linalg.norm(off) > 0.5 / 700
+    assert np.linalg.norm(off) < 0.05 / 700
     assert off @ np.linalg.solve(result.covariance_6[:3, :3], off) < 16.3
+
+
+@pytest.mark.parametrize('k1', [-0.02, 0.02])
+def test_a_wrong_calibration_is_no_parallax(k1):
+    """What is left by a rotation is five times the noise, and all of it is due to the lens."""
+    seen = two_views(np.random.default_rng(48), count=500, near=1e5, far=1e6)
+    x, y = (distort(K, places, k1) for places in (seen.x, seen.y))
+    y = y + np.random.default_rng(49).normal(0, 0.03, y.shape)
+    result = TwoViewEstimator(EstimatorConfig(method='rpe')).estimate_matched(
+        uniform_view(), uniform_view(), x, y)
+    assert result.status == Status.NO_PARALLAX
+    alone = fit_rotation(rays(K, x), rays(K, y))
+    assert errors_of(replace(result, R=alone), seen.R, seen.t)[0] > 0.01
+    assert errors_of(result, seen.R, seen.t)[0] < 0.004
 
 
 class WatchedSurface(DescriptorSurface):

@@ -82,3 +82,19 @@ def test_on_a_street_its_first_step_counts() -> None:
     for result, motion, _ in seen_slowly('road', 20, 16, range(16, 20)):
         if result.status is not Status.FIRST_FRAME:
             assert result.status is Status.OK and direction_error(result, motion) < 1
+
+
+@pytest.mark.slow
+def test_along_a_desk_a_rotation_does_not_absorb_a_centimetre() -> None:
+    """
+    It moves all points by as much, but for half a pixel: too little for a direction.
+
+    The pair's rotation is that of its pose; landmarks tell how far the camera went.
+    """
+    steps = list(seen_slowly('handheld', 1, 1, range(6)))
+    unit = np.linalg.norm(steps[1][1][:3, 3])
+    result, motion, _ = steps[5]
+    assert result.status is Status.NO_PARALLAX
+    assert np.degrees(rotation_angle(result.motion[:3, :3], motion[:3, :3])) < 0.02
+    before, after = (result.pose for result, _, _ in steps[4:])
+    assert np.linalg.inv(before)[:3] @ after[:, 3] == pytest.approx(motion[:3, 3] / unit, abs=0.05)

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from djet_ros.core.geometry import rays, sphere_tangents
+from djet_ros.core.geometry import fit_rotation, norms, rays, rotation_exp, sphere_tangents
+from djet_ros.core.medians import median
 from djet_ros.core.types import Array, RelativePose
 import numpy as np
 
@@ -18,6 +19,9 @@ _MATCHES = 300
 
 # Least information in any direction of a motion, relative to that of all.
 _LEAST = 1e-12
+
+# Least square of a distance in units of the focal length, against division by zero.
+_LEAST_SQUARE = 1e-18
 
 
 class Correction(NamedTuple):
@@ -78,3 +82,44 @@ def displacements(u: Array) -> Array:
     by_field[:, :, 0], by_field[:, :, 1] = u * (u * u).sum(1, keepdims=True), u
     by_field[:, :, 2:] = np.eye(2)
     return by_field
+
+
+def turn_of_deviating_camera(rays_x: Array, rays_y: Array, sigmas: Array, rounds: int = 5
+                             ) -> tuple[Array, Array]:
+    """
+    Fit a rotation R (3, 3) of a camera that may deviate from its calibration, robustly.
+
+    sigmas: (4,) prior standard deviations of the fields of a `Correction`; rays_x, rays_y: (N, 3).
+    Returns R, and the distances (N,) of y from where it brings x, in units of the focal length.
+    Robust as `fit_rotation`.
+    """
+    x, y = (rays[:, :2] / rays[:, 2:] for rays in (rays_x, rays_y))
+    R, deviation, by_x = fit_rotation(rays_x, rays_y), np.zeros(OF_CAMERA), displacements(x)
+    prior = np.diag(np.append(np.zeros(3), 1 / sigmas**2))
+    for _ in range(rounds):
+        residuals, J = _turned(R, deviation, x, y, by_x)
+        squared = (residuals**2).sum(1)
+        weights = 1 / (max(median(squared), _LEAST_SQUARE) + squared)
+        weighted = np.einsum('n,nia->nia', weights, J).reshape(-1, 3 + OF_CAMERA).T
+        step = np.linalg.solve(weighted @ J.reshape(-1, 3 + OF_CAMERA) + prior,
+                               weighted @ residuals.ravel() - prior[:, 3:] @ deviation)
+        R, deviation = rotation_exp(step[:3]) @ R, deviation + step[3:]
+    return R, norms(_turned(R, deviation, x, y, by_x)[0])
+
+
+def _turned(R: Array, deviation: Array, x: Array, y: Array, by_x: Array) -> tuple[Array, Array]:
+    """
+    Return the residuals (N, 2) of y after a rotation of x, and what they take from (N, 2, 7).
+
+    Those are the derivatives of what is subtracted from y, by a step of the rotation from the left
+    and by the deviation (4,); by_x: (N, 2, 4) `displacements` at x.
+    """
+    turned = x @ R[:, :2].T + R[:, 2]
+    places = turned[:, :2] / turned[:, 2:]
+    (u, v), one = places.T, np.ones(len(x))
+    by_turn = np.stack([-u * v, one + u * u, -v, -one - v * v, u * v, u], axis=1)
+    by_place = (R[:2, :2] - places[:, :, None] * R[2, :2]) / turned[:, 2:, None]
+    # Both places are seen displaced: y where the true one of x would be brought.
+    by_camera = displacements(places) - by_place @ by_x
+    return (y - places - by_camera @ deviation,
+            np.concatenate([by_turn.reshape(-1, 2, 3), by_camera], axis=2))

@@ -26,7 +26,7 @@ from djet_ros.core.bundle import (
     Reduced,
 )
 from djet_ros.core.correction import motion_shift, OF_CAMERA
-from djet_ros.core.geometry import norms, skew, sphere_tangents
+from djet_ros.core.geometry import norms, rotation_log, skew, sphere_tangents
 from djet_ros.core.jet import LEAST_CURVATURE, Loss
 from djet_ros.core.medians import median
 from djet_ros.core.types import Array, RelativePose
@@ -57,8 +57,9 @@ class JointTuning:
 
 JOINT_TUNING = JointTuning()
 
-# Information on the rotation of a pair without parallax, which has no covariance: 1 mrad.
-_ROTATION_INFORMATION = 1e6
+# rad; chosen: standard deviation added to that of the rotation of a pair without parallax, which
+# landmarks of known depths tell better.
+_ROTATION_SIGMA = 1e-3
 
 
 class CameraInformation(NamedTuple):
@@ -152,8 +153,10 @@ class JointProblem:
             gradient = along * (length - expected) / sigma
         else:
             by_poses = np.concatenate([np.zeros((3, OF_CAMERA)), J[:3]], axis=1)
-            information = by_poses.T @ by_poses * _ROTATION_INFORMATION
-            gradient = np.zeros(OF_CAMERA + 12)
+            weighted = np.linalg.solve(
+                relative.covariance_5[:3, :3] + _ROTATION_SIGMA**2 * np.eye(3), by_poses).T
+            information = weighted @ by_poses
+            gradient = weighted @ rotation_log(self.newest_motion[0] @ R.T)
         H, g = np.zeros_like(self.prior.H), np.zeros_like(self.prior.g)
         # The camera comes first, the newest two frames last.
         places = np.r_[:OF_CAMERA, len(g) - 12:len(g)]

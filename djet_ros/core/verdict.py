@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from djet_ros.core.algorithm import ALGORITHM_TUNING, Track
+from djet_ros.core.correction import turn_of_deviating_camera
 from djet_ros.core.covariance import (
     calibration_covariance,
     is_within,
@@ -42,6 +43,7 @@ from djet_ros.core.rivals import (
     preferences,
     SIGNIFICANT_PREFERENCE,
 )
+from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Array, Pose, RelativePose, Rival, Status
 import numpy as np
 from numpy.typing import NDArray
@@ -93,10 +95,11 @@ def verdict(pair: Pair, track: Track, config: EstimatorConfig) -> RelativePose:
         status, t = Status.DEGENERATE, np.zeros(3)
     elif _false_alarm(pair, track, count, config):
         status = Status.TOO_FEW_INLIERS
-    elif (rotation := _rotation_alone(K, rays_x, rays_y, y, track.scale, config)) is not None:
+    elif (rotations := _without_parallax(pair, track, pose, (rays_x, rays_y), y, config)
+          ) is not None:
         # t is not determined.
-        status, R, t = Status.NO_PARALLAX, rotation, np.zeros(3)
-        covariance = _of_rotation_alone(covariance, pose.R, R, rays_x, rays_y)
+        (R, other), status, t = rotations, Status.NO_PARALLAX, np.zeros(3)
+        covariance = _of_rotation_alone(covariance, other, R, rays_x, rays_y)
     else:
         status, covariance, rivals = _compare_with_rivals(
             pose, covariance, track, pair.x, pair.prior, sign_open)
@@ -184,23 +187,24 @@ def as_pure_rotation(relative: RelativePose, K: Array) -> RelativePose:
                    covariance_6=lifted_covariance(covariance, relative.t))
 
 
-def _of_rotation_alone(covariance: Array, R: Array, alone: Array, rays_x: Array, rays_y: Array
+def _of_rotation_alone(covariance: Array, other: Array, R: Array, rays_x: Array, rays_y: Array
                        ) -> Array:
     """
-    Return the covariance (5, 5) of a pose if its rotation R is replaced by a rotation alone.
+    Return the covariance (5, 5) of a pair without parallax, from that of its pose.
 
-    That absorbs a translation along a surface, the more the narrower the image, as long as both
-    look alike to within the noise. So its expected squared error is the mean of those by two
-    motions with a translation, of which either may be right: the pose, and the motion in front of
-    a plane. (A pose may be of the wrong basin: without parallax, its t may be any.)
+    A rotation absorbs a translation along a surface, the more the narrower the image, as long as
+    both look alike to within the noise. So the expected squared error is the mean of those by two
+    motions, of which either may be right: one with the other rotation (that of the pose, usually,
+    which may be of the wrong basin: without parallax, its t may be any), and the motion in front
+    of a plane.
 
-    covariance: (5, 5) of the pose; alone: (3, 3); rays_x, rays_y: (N, 3).
+    R, other: (3, 3), see `_without_parallax`; rays_x, rays_y: (N, 3).
     """
-    turn, of_turn = turn_before_plane(rays_x @ alone.T, rays_y)
+    turn, of_turn = turn_before_plane(rays_x @ R.T, rays_y)
     before_plane = covariance.copy()
     before_plane[:3, 3:], before_plane[3:, :3] = 0.0, 0.0
     before_plane[:3, :3] = of_turn + np.outer(turn, turn)
-    off = np.append(rotation_log(alone @ R.T), [0.0, 0.0])
+    off = np.append(rotation_log(R @ other.T), [0.0, 0.0])
     return (widened_to_span(covariance, off, 1.0) + before_plane) / 2
 
 
@@ -332,15 +336,36 @@ def _random_descriptors(hamming: Array) -> bool:
     return bool(known.size and median(known) > _RANDOM_BITS)
 
 
-def _rotation_alone(K: Array, rays_x: Array, rays_y: Array, y: Array, noise: float,
-                    config: EstimatorConfig) -> Array | None:
+def _without_parallax(pair: Pair, track: Track, pose: Pose, rays_of: tuple[Array, Array],
+                      y: Array, config: EstimatorConfig) -> tuple[Array, Array] | None:
     """
-    Return the rotation that alone explains the inliers; None if their parallax is too large.
+    Return the rotation (3, 3) of a pair without parallax, and another one that may be right.
 
-    rays_x, rays_y: (N, 3); y: (N, 2) pixels of the latter; noise: standard deviation in pixels.
+    None if the parallax of the inliers is too large. A rotation alone, if it explains them to
+    within their noise. If not, a parallax below ``min_parallax`` may be due to an error of the
+    calibration: then it is the rotation with that error, if this explains them. The other one is
+    that of the pose. If neither does, there is a parallax, too small for a direction to rely on.
+    A rotation alone then absorbs what all parallaxes have in common, many times what is left of
+    them in front of a wall; so it is that of the pose, unless the pose may be of the wrong basin.
+
+    rays_of: (N, 3) of the inliers in both images; y: (N, 2) pixels of the latter.
     """
-    R = fit_rotation(rays_x, rays_y)
-    rotated = rays_x @ (K @ R).T
-    # The upper quartile.
-    parallax = quantile(norms(y - rotated[:, :2] / rotated[:, 2:]), 0.75)
-    return R if parallax < max(config.min_parallax, _PARALLAX_OVER_NOISE * noise) else None
+    K, within = pair.current.K, _PARALLAX_OVER_NOISE * track.scale
+    R = fit_rotation(*rays_of)
+    rotated = rays_of[0] @ (K @ R).T
+    parallax = _upper_quartile(norms(y - rotated[:, :2] / rotated[:, 2:]))
+    if parallax < within:
+        return R, pose.R
+    if parallax >= config.min_parallax:
+        return None
+    sigmas = SelfCalibration.unknown(K, pair.current.gray.shape).prior_sigmas
+    turn, left = turn_of_deviating_camera(*rays_of, sigmas)
+    decided = all(rival.preference >= SIGNIFICANT_PREFERENCE
+                  for rival in (*track.rivals, *track.nearby))
+    unexplained = _upper_quartile(left) * K[0, 0] >= within
+    return (pose.R, turn) if unexplained and decided else (turn, pose.R)
+
+
+def _upper_quartile(distances: Array) -> float:
+    """Return the upper quartile of distances (N,)."""
+    return float(quantile(distances, 0.75))

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 from djet_ros.core.bundle import Landmarks, projected
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import (
+    fit_rotation,
     inverse_depths,
     norms,
     rays,
@@ -318,7 +319,21 @@ class Window:
     def _moved(self, relative: RelativePose, length: float) -> tuple[Array, Array]:
         """Return the pose R (3, 3), t (3,) after a pair of some length."""
         R, t = self._joint.poses.R[-1], self._joint.poses.t[-1]
-        return relative.R @ R, relative.R @ t + length * relative.t
+        turn = relative.R if relative.t.any() else self._turn(relative)
+        return turn @ R, turn @ t + length * relative.t
+
+    def _turn(self, relative: RelativePose) -> Array:
+        """
+        Return the rotation (3, 3) that brings landmarks to where they are after a pair without t.
+
+        Which the pair's rotation may not do, if there is a small translation: a rotation alone
+        absorbs that.
+        """
+        if not relative.inliers.any():
+            return relative.R
+        rays_x, rays_y = (rays(self._joint.K, places[relative.inliers])
+                          for places in (relative.x, relative.placed))
+        return fit_rotation(rays_x, rays_y)
 
     def _measured(self, relative: RelativePose) -> _Measured | None:
         """Return the length by points of known depth; None for few of them."""
