@@ -623,6 +623,20 @@ def test_outlier_loops_are_rejected(optimise):
     assert np.allclose(solution.graph.poses, clean.graph.poses, atol=0.05)
 
 
+@pytest.mark.parametrize('share', [0.03, 0.1])
+def test_wrong_loops_that_agree_do_not_outweigh_the_odometry(optimise, share):
+    """Past equal houses, each loop says that no house was passed; their bend costs more."""
+    true = np.array([pose(z=float(i)) for i in range(60)])
+    graph = chain(true, np.diag([share, share, share, *SIGMAS[3:]])**2)
+    wrong = tuple(replace(loop(true, i, i - 10), motion=pose(z=-0.3)) for i in range(10, 60, 2))
+    right = loop(true, 55, 50)
+    solution = optimise(replace(graph, edges=(*graph.edges, *wrong, right)))
+    assert solution.rejected('loop') == len(wrong)
+    assert solution.trust[-1] > 0.9
+    assert (solution.trust[:len(graph.edges)] == 1).all()
+    assert np.allclose(solution.graph.poses, true, atol=share)
+
+
 @pytest.mark.parametrize(('square', 'rejected'), [(12.0, 0), (15.0, 0), (19.0, 1), (40.0, 1)])
 def test_loop_is_rejected_beyond_its_99_percent_bound(optimise, square, rejected):
     """Of chi-squared with six degrees of freedom it is 16.8; the odometry is exact."""
