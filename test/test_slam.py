@@ -379,13 +379,18 @@ def test_keyframes_in_a_file_take_no_memory():
 def test_full_disk_is_reported(tmp_path):
     with pytest.raises(DjetError, match='nowhere'):
         KeyframeFile(tmp_path / 'nowhere')
-    with KeyframeFile(tmp_path) as file, pytest.raises(DjetError, match='free disk space'):
-        # as long as a file may be, as on a full disk
-        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    frame = Cards().frame(0.1)
+    image = KeyframeImage(frame, TwoViewEstimator().features(frame.gray))
+    with KeyframeFile(tmp_path) as file:
+        file[0] = image
+        size = file._file.seek(0, 2)
+    # as long as a file may be, as on a full disk; also if only the last bytes do not fit
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for most in 10_000, size - 1:
         try:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
-            frame = Cards().frame(0.1)
-            file[0] = KeyframeImage(frame, TwoViewEstimator().features(frame.gray))
+            resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
+            with pytest.raises(DjetError, match='free disk space'), KeyframeFile(tmp_path) as file:
+                file[0] = image
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
@@ -896,6 +901,24 @@ def test_a_mistake_in_the_command_costs_no_earlier_results(closed, drive, tmp_pa
         assert report in refused.stderr
         assert {path: path.read_bytes() for path in (tmp_path / 'slam').rglob('*')
                 if path.is_file()} == before
+
+
+@pytest.mark.slow
+def test_a_recording_without_a_usable_image_costs_no_earlier_results(closed, drive, tmp_path):
+    shutil.copytree(closed, tmp_path / 'slam')
+    before = {path: path.read_bytes() for path in (tmp_path / 'slam').rglob('*') if path.is_file()}
+    shutil.copytree(drive, tmp_path / '00')
+    for path in (tmp_path / '00' / 'image_0').iterdir():
+        path.write_bytes(path.read_bytes()[:500])
+    refused = djet('slam', tmp_path / '00', '--output', tmp_path / 'slam', '--overwrite', expect=2)
+    assert 'none of 17 images could be used' in refused.stderr
+    assert {path: path.read_bytes() for path in (tmp_path / 'slam').rglob('*')
+            if path.is_file()} == before
+    # Of a replay that begins, the graph of the earlier one is none.
+    for path in list((tmp_path / '00' / 'image_0').iterdir())[1:]:
+        path.write_bytes((drive / 'image_0' / path.name).read_bytes())
+    djet('slam', tmp_path / '00', '--output', tmp_path / 'slam', '--overwrite', expect=2)
+    assert [path.name for path in (tmp_path / 'slam').iterdir()] == ['replay']
 
 
 @pytest.mark.slow
