@@ -151,6 +151,10 @@ def test_an_edge_between_keyframes_with_one_reference_has_the_errors_of_both(key
         Step(10**9 * (i + 1), Status.OK, here[i], 10**9, here[i], covariance, True, keyframe=True)
         for i in (1, 2)]
     edge = keyframes(taken)[0].edges[-1]
+    # The errors of the lengths are known better than length_noise; in the axes of the first one.
+    R, along = here[1][:3, :3], [unit(one[:3, 3]) for one in here[1:]]
+    own = sum(SIGMAS[0]**2 * np.outer(one, one) for one in along)
+    assert np.allclose(edge.uncorrelated, R.T @ own @ R)
     rng, offs = np.random.default_rng(0), []
     for _ in range(4000):
         wrong = []
@@ -955,6 +959,17 @@ def test_gtsam_built_for_another_numpy_is_refused_before_it_crashes(tmp_path, mo
         'gtsam 4.2.2 does not work with NumPy 2.4.6: ')
     for versions['gtsam'], versions['numpy'] in (('4.2.2', '1.26.4'), ('4.3.0', '2.4.6')):
         assert libraries.problem_of('gtsam') == ''
+
+
+@pytest.mark.slow
+def test_warnings_of_the_replay_are_those_of_slam_too(drive, tmp_path):
+    """Ground truth with another clock gives no errors, and somebody has to say so."""
+    truth = tmp_path / 'truth.txt'
+    truth.write_text(''.join(f'{5000 + 0.1 * i} {0.25 * i} 0 0 0 0 0 1\n' for i in range(17)))
+    printed = djet('slam', drive, '--output', tmp_path / 'slam', '--poses', truth, *NO_LOOPS)
+    assert 'errors' not in json.loads((tmp_path / 'slam' / 'slam.json').read_text())
+    assert f'djet: warning: no errors were computed: the stamps of {truth} are' in printed.stderr
+    assert printed.stderr.count('djet: warning: ') == 1
 
 
 @pytest.mark.slow

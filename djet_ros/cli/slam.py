@@ -68,6 +68,8 @@ def run(args: argparse.Namespace) -> int:
         with opened_replay(args, config, args.input, results,
                            derived=[args.output / name for name in FILES]) as replay:
             outcome = replay()
+        for line in outcome.advice:
+            warn(line)
         if outcome.problem:
             raise DjetError(outcome.problem)
     source, name = _source(results, args, config)
