@@ -634,16 +634,27 @@ def test_outlier_loops_are_rejected(optimise):
 
 @pytest.mark.parametrize('share', [0.03, 0.1])
 def test_wrong_loops_that_agree_do_not_outweigh_the_odometry(optimise, share):
-    """Past equal houses, each loop says that no house was passed; their bend costs more."""
-    true = np.array([pose(z=float(i)) for i in range(60)])
+    """Past equal houses, each loop says that no house was passed; so did a map before."""
+    true, before = (np.array([pose(z=by * i) for i in range(60)]) for by in (1.0, 0.1))
     graph = chain(true, np.diag([share, share, share, *SIGMAS[3:]])**2)
     wrong = tuple(replace(loop(true, i, i - 10), motion=pose(z=-0.3)) for i in range(10, 60, 2))
     right = loop(true, 55, 50)
-    solution = optimise(replace(graph, edges=(*graph.edges, *wrong, right)))
+    solution = optimise(replace(graph, poses=before, edges=(*graph.edges, *wrong, right)))
     assert solution.rejected('loop') == len(wrong)
     assert solution.trust[-1] > 0.9
     assert (solution.trust[:len(graph.edges)] == 1).all()
     assert np.allclose(solution.graph.poses, true, atol=share)
+
+
+def test_many_loops_outvote_a_wrong_step_of_the_odometry(optimise):
+    """It is 28 standard deviations off, and a hundred loops agree with the rest."""
+    true, _ = twice_round(10)
+    graph = chain(true)
+    off = replace(graph.edges[4], motion=graph.edges[4].motion @ pose(x=28 * SIGMAS[0]))
+    loops = [loop(true, 10 + i, (i + j) % 10) for i in range(10) for j in range(10)]
+    solution = optimise(replace(graph, edges=(*graph.edges[:4], off, *graph.edges[5:], *loops)))
+    assert solution.rejected('loop') == 0
+    assert np.allclose(solution.graph.poses, true, atol=0.1)
 
 
 @pytest.mark.parametrize(('square', 'rejected'), [(12.0, 0), (15.0, 0), (19.0, 1), (40.0, 1)])
