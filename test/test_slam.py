@@ -930,10 +930,22 @@ def test_a_recording_without_a_usable_image_costs_no_earlier_results(closed, dri
     assert {path: path.read_bytes() for path in (tmp_path / 'slam').rglob('*')
             if path.is_file()} == before
     # Of a replay that begins, the graph of the earlier one is none.
-    for path in list((tmp_path / '00' / 'image_0').iterdir())[1:]:
-        path.write_bytes((drive / 'image_0' / path.name).read_bytes())
+    shutil.copy(drive / 'image_0' / '000003.png', tmp_path / '00' / 'image_0')
     djet('slam', tmp_path / '00', '--output', tmp_path / 'slam', '--overwrite', expect=2)
     assert [path.name for path in (tmp_path / 'slam').iterdir()] == ['replay']
+
+
+@pytest.mark.slow
+def test_a_recording_is_used_up_to_its_damage(drive, tmp_path):
+    """As after a battery that was empty."""
+    djet('kitti-to-bag', drive, tmp_path / 'bag')
+    file, = (tmp_path / 'bag').glob('*.mcap')
+    file.write_bytes(file.read_bytes()[:file.stat().st_size // 2])
+    (tmp_path / 'bag' / 'metadata.yaml').unlink()
+    printed = djet('slam', tmp_path / 'bag', '--output', tmp_path / 'slam', *NO_LOOPS).stderr
+    assert f'djet: warning: {file}: the chunk at byte' in printed
+    assert 'everything before that was read' in printed
+    assert 5 < json.loads((tmp_path / 'slam' / 'slam.json').read_text())['frames'] < 12
 
 
 @pytest.mark.slow

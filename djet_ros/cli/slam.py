@@ -70,8 +70,11 @@ def run(args: argparse.Namespace) -> int:
             outcome = replay()
         for line in outcome.advice:
             warn(line)
-        if outcome.problem:
+        if outcome.problem and not outcome.summary['frames']:
             raise DjetError(outcome.problem)
+        if outcome.problem:
+            # As of results: what could be replayed is used.
+            warn(outcome.problem)
     source, name = _source(results, args, config)
     try:
         steps = read_steps(results, warn)
