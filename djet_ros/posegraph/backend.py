@@ -79,18 +79,19 @@ def optimise(graph: PoseGraph, first: float = 1.0) -> OptimisedGraph:
                                      if edge.kind in _KNOWN_INLIERS)])
     # While the kernel is still wide the cost hardly changes, which is not convergence.
     parameters.setRelativeCostTol(0.0)
-    optimizer = gtsam.GncLMOptimizer(factor_graph(graph), initial_values(graph.poses), parameters)
+    plain = factor_graph(graph)
+    optimizer = gtsam.GncLMOptimizer(plain, initial_values(graph.poses), parameters)
     values = optimizer.optimize()
     trust = np.asarray(optimizer.getWeights())[1:]
     # Wrong loops that agree with one another, as between equal houses, all start with their full
     # weight, and then bend the odometry by more than it costs to reject them.
-    squares = _Squares.of(graph, values)
+    squares = _Squares.of(graph, plain, values)
     if squares.strain > _STRAINED:
         chain = initial_values(_chained(graph))
-        if _Squares.of(graph, chain).cost < squares.cost:
+        if _Squares.of(graph, plain, chain).cost < squares.cost:
             values = gtsam.LevenbergMarquardtOptimizer(
                 factor_graph(graph, robust=True), chain).optimize()
-            trust = _Squares.of(graph, values).trust
+            trust = _Squares.of(graph, plain, values).trust
     return OptimisedGraph(replace(graph, poses=poses_of(values, len(graph.poses))), trust, factors)
 
 
@@ -105,10 +106,10 @@ class _Squares(NamedTuple):
     known: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, graph: PoseGraph, values: gtsam.Values) -> _Squares:
-        """Return those of a graph."""
-        factors = factor_graph(graph)
-        return cls(np.array([2 * factors.at(number).error(values)
+    def of(cls, graph: PoseGraph, plain: gtsam.NonlinearFactorGraph, values: gtsam.Values
+           ) -> _Squares:
+        """Return those of a graph, from its factors without a kernel."""
+        return cls(np.array([2 * plain.at(number).error(values)
                              for number in range(1, len(graph.edges) + 1)]),
                    np.array([edge.kind in _KNOWN_INLIERS for edge in graph.edges], bool))
 
