@@ -478,27 +478,33 @@ def test_odometry_reset_continues_at_the_last_pose_until_a_loop_corrects_it(live
     assert after.max() < 0.1
 
 
-def test_after_a_loop_the_map_goes_on_in_the_unit_that_the_loop_has_corrected(live):
-    """An odometry whose unit of length grows by 3 % per frame, until it comes back."""
+@pytest.fixture
+def growing(live):
+    """Drive to and fro with a unit of length that grows by 3 % per frame, which a loop finds."""
     drive = Drive(live, drift=0.0)
-    result = drive.odometry._result
-    drive.odometry._result = lambda *args: replace(result(*args), metric=False)
-    move, unit_of_length = drive.odometry.move, 1.0
+    result, move = drive.odometry._result, drive.odometry.move
+    drive.metric, drive.unit_of_length = False, 1.0
+    drive.odometry._result = lambda *args: replace(result(*args), metric=drive.metric)
 
     def move_in_its_unit(motion):
         in_unit = motion.copy()
-        in_unit[:3, 3] /= unit_of_length
+        in_unit[:3, 3] /= drive.unit_of_length
         return move(in_unit, np.diag([(0.06 * 0.25)**2, *SIGMAS[1:]**2]))
 
     drive.odometry.move = move_in_its_unit
     drive.start()
     for i in (*range(1, 9), *range(7, -1, -1)):
-        unit_of_length *= 1.03
+        drive.unit_of_length *= 1.03
         drive.go(pose(x=0.25 * i))
-    optimisations, newest = drive.reported['optimisations'], drive.slam.map.keyframes[-1]
-    assert newest.factor > 1.3
+    assert drive.slam.map.keyframes[-1].factor > 1.3
     # where there is no loop to find
     drive.slam.map.search_loops = lambda: bool(drive.slam.map._pending.clear())
+    return drive
+
+
+def test_after_a_loop_the_map_goes_on_in_the_unit_that_the_loop_has_corrected(growing):
+    drive, newest = growing, growing.slam.map.keyframes[-1]
+    optimisations = drive.reported['optimisations']
     for i in range(1, 9):
         drive.go(pose(x=-0.25 * i))
     assert drive.reported['optimisations'] == optimisations
@@ -511,6 +517,26 @@ def test_after_a_loop_the_map_goes_on_in_the_unit_that_the_loop_has_corrected(li
             newest.factor * length)
         if stamp in drive.corrections:
             assert np.allclose(drive.corrections[stamp] @ drive.by_odometry[stamp], poses[stamp])
+
+
+def test_metres_are_metres_in_a_map_whose_relative_unit_was_corrected(growing):
+    """The first speed comes after the loop: no motion in metres is scaled, at no time."""
+    drive, keyframes = growing, growing.slam.map.keyframes
+    place = 0.0
+    while keyframes[-1].stamp_ns != max(drive.true):
+        place -= 0.25
+        drive.go(pose(x=place))
+    drive.metric, drive.unit_of_length, last = True, 1.0, len(keyframes) - 1
+    assert keyframes[last].factor > 1.3
+    for i in range(1, 6):
+        drive.go(pose(x=place - 0.25 * i))
+        # with an optimisation since, or without; also where no keyframe is of metres yet
+        for _ in range(2):
+            here = drive.slam.map.correction @ drive.by_odometry[max(drive.true)]
+            assert np.linalg.norm((here - keyframes[last].pose)[:3, 3]) == pytest.approx(
+                0.25 * i, rel=1e-3)
+            drive.slam.map.optimise()
+    assert [one.factor for one in keyframes][last:] == [1.0] * 3
 
 
 @pytest.mark.parametrize(('first', 'unit_of_length'), [(0, 0.5), (7, 0.7)])

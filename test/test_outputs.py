@@ -15,7 +15,7 @@ from djet_ros.config.sections import Config
 from djet_ros.errors import DjetError
 from djet_ros.lab.store import FILE_NAME, RecordStore
 from djet_ros.lab.style import figure
-from djet_ros.recordings.outputs import check_ours, write_whole
+from djet_ros.recordings.outputs import check_ours, replaced_together, write_whole
 from djet_ros.replay.results import plot_trajectory, ResultsFolder
 import numpy as np
 import pytest
@@ -83,6 +83,25 @@ def test_a_figure_that_can_not_be_written_leaves_the_earlier_one_and_is_named(
     with full_disk(), pytest.raises(DjetError, match='plot.png could not be written: File too'):
         plot_trajectory(path, np.zeros((2, 3)), None, np.empty((0, 2), np.float32), 'none', 'm')
     assert held(tmp_path) == {'plot.png': 'earlier'}
+
+
+def test_files_of_a_run_replace_those_of_an_earlier_one_all_or_none(tmp_path: Path) -> None:
+    names = ('graph', 'plot', 'truth')
+    earlier = {'graph': 'earlier', 'truth': 'earlier', 'notes': 'mine'}
+    for name, text in earlier.items():
+        (tmp_path / name).write_text(text, 'utf-8')
+    for error in (OSError('full'), KeyboardInterrupt()):
+        with pytest.raises(type(error)), replaced_together(tmp_path, names, True) as new:
+            (new / 'graph').write_text('new', 'utf-8')
+            assert {path.name for path in tmp_path.iterdir()} == {*earlier, new.name}
+            raise error
+        assert held(tmp_path) == earlier
+    with pytest.raises(DjetError, match='--overwrite'), replaced_together(tmp_path, names, False):
+        pass
+    with replaced_together(tmp_path, names, True) as new:
+        for name in ('graph', 'plot'):
+            (new / name).write_text('new', 'utf-8')
+    assert held(tmp_path) == {'graph': 'new', 'plot': 'new', 'notes': 'mine'}
 
 
 @pytest.mark.parametrize('present', [False, True])

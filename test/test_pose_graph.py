@@ -174,6 +174,7 @@ def test_repeated_stamps_after_a_reset_get_their_own_motions(tmp_path):
 def test_time_gap_is_an_edge_with_unknown_motion(tmp_path):
     graph = read_results(replayed(tmp_path / 'results', Drive(gaps=[3])))
     assert [edge.kind for edge in graph.edges] == ['odometry', 'odometry', 'unknown', 'odometry']
+    assert [(edge.source, edge.target) for edge in graph.edges] == [(0, 1), (1, 2), (2, 3), (3, 4)]
     assert np.array_equal(graph.edges[2].covariance, UNKNOWN_MOTION)
     assert graph.edges[2].information().max() < 1
 

@@ -151,6 +151,10 @@ def test_an_edge_between_keyframes_with_one_reference_has_the_errors_of_both(key
         Step(10**9 * (i + 1), Status.OK, here[i], 10**9, here[i], covariance, True, keyframe=True)
         for i in (1, 2)]
     edge = keyframes(taken)[0].edges[-1]
+    # The errors of the lengths are known better than length_noise; in the axes of the first one.
+    R, along = here[1][:3, :3], [unit(one[:3, 3]) for one in here[1:]]
+    own = sum(SIGMAS[0]**2 * np.outer(one, one) for one in along)
+    assert np.allclose(edge.uncorrelated, R.T @ own @ R)
     rng, offs = np.random.default_rng(0), []
     for _ in range(4000):
         wrong = []
@@ -379,13 +383,18 @@ def test_keyframes_in_a_file_take_no_memory():
 def test_full_disk_is_reported(tmp_path):
     with pytest.raises(DjetError, match='nowhere'):
         KeyframeFile(tmp_path / 'nowhere')
-    with KeyframeFile(tmp_path) as file, pytest.raises(DjetError, match='free disk space'):
-        # as long as a file may be, as on a full disk
-        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    frame = Cards().frame(0.1)
+    image = KeyframeImage(frame, TwoViewEstimator().features(frame.gray))
+    with KeyframeFile(tmp_path) as file:
+        file[0] = image
+        size = file._file.seek(0, 2)
+    # as long as a file may be, as on a full disk; also if only the last bytes do not fit
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for most in 10_000, size - 1:
         try:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
-            frame = Cards().frame(0.1)
-            file[0] = KeyframeImage(frame, TwoViewEstimator().features(frame.gray))
+            resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
+            with pytest.raises(DjetError, match='free disk space'), KeyframeFile(tmp_path) as file:
+                file[0] = image
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
@@ -621,6 +630,31 @@ def test_outlier_loops_are_rejected(optimise):
     assert (solution.trust[-len(wrong):] < 0.1).all()
     assert (solution.trust[:-len(wrong)] > 0.5).all()
     assert np.allclose(solution.graph.poses, clean.graph.poses, atol=0.05)
+
+
+@pytest.mark.parametrize('share', [0.03, 0.1])
+def test_wrong_loops_that_agree_do_not_outweigh_the_odometry(optimise, share):
+    """Past equal houses, each loop says that no house was passed; so did a map before."""
+    true, before = (np.array([pose(z=by * i) for i in range(60)]) for by in (1.0, 0.1))
+    graph = chain(true, np.diag([share, share, share, *SIGMAS[3:]])**2)
+    wrong = tuple(replace(loop(true, i, i - 10), motion=pose(z=-0.3)) for i in range(10, 60, 2))
+    right = loop(true, 55, 50)
+    solution = optimise(replace(graph, poses=before, edges=(*graph.edges, *wrong, right)))
+    assert solution.rejected('loop') == len(wrong)
+    assert solution.trust[-1] > 0.9
+    assert (solution.trust[:len(graph.edges)] == 1).all()
+    assert np.allclose(solution.graph.poses, true, atol=share)
+
+
+def test_many_loops_outvote_a_wrong_step_of_the_odometry(optimise):
+    """It is 28 standard deviations off, and a hundred loops agree with the rest."""
+    true, _ = twice_round(10)
+    graph = chain(true)
+    off = replace(graph.edges[4], motion=graph.edges[4].motion @ pose(x=28 * SIGMAS[0]))
+    loops = [loop(true, 10 + i, (i + j) % 10) for i in range(10) for j in range(10)]
+    solution = optimise(replace(graph, edges=(*graph.edges[:4], off, *graph.edges[5:], *loops)))
+    assert solution.rejected('loop') == 0
+    assert np.allclose(solution.graph.poses, true, atol=0.1)
 
 
 @pytest.mark.parametrize(('square', 'rejected'), [(12.0, 0), (15.0, 0), (19.0, 1), (40.0, 1)])
@@ -885,6 +919,36 @@ def test_a_mistake_in_the_command_costs_no_earlier_results(closed, drive, tmp_pa
 
 
 @pytest.mark.slow
+def test_a_recording_without_a_usable_image_costs_no_earlier_results(closed, drive, tmp_path):
+    shutil.copytree(closed, tmp_path / 'slam')
+    before = {path: path.read_bytes() for path in (tmp_path / 'slam').rglob('*') if path.is_file()}
+    shutil.copytree(drive, tmp_path / '00')
+    for path in (tmp_path / '00' / 'image_0').iterdir():
+        path.write_bytes(path.read_bytes()[:500])
+    refused = djet('slam', tmp_path / '00', '--output', tmp_path / 'slam', '--overwrite', expect=2)
+    assert 'none of 17 images could be used' in refused.stderr
+    assert {path: path.read_bytes() for path in (tmp_path / 'slam').rglob('*')
+            if path.is_file()} == before
+    # Of a replay that begins, the graph of the earlier one is none.
+    shutil.copy(drive / 'image_0' / '000003.png', tmp_path / '00' / 'image_0')
+    djet('slam', tmp_path / '00', '--output', tmp_path / 'slam', '--overwrite', expect=2)
+    assert [path.name for path in (tmp_path / 'slam').iterdir()] == ['replay']
+
+
+@pytest.mark.slow
+def test_a_recording_is_used_up_to_its_damage(drive, tmp_path):
+    """As after a battery that was empty."""
+    djet('kitti-to-bag', drive, tmp_path / 'bag')
+    file, = (tmp_path / 'bag').glob('*.mcap')
+    file.write_bytes(file.read_bytes()[:file.stat().st_size // 2])
+    (tmp_path / 'bag' / 'metadata.yaml').unlink()
+    printed = djet('slam', tmp_path / 'bag', '--output', tmp_path / 'slam', *NO_LOOPS).stderr
+    assert f'djet: warning: {file}: the chunk at byte' in printed
+    assert 'everything before that was read' in printed
+    assert 5 < json.loads((tmp_path / 'slam' / 'slam.json').read_text())['frames'] < 12
+
+
+@pytest.mark.slow
 def test_overwriting_run_removes_all_earlier_results(closed, drive, tmp_path):
     out = tmp_path / 'slam'
     shutil.copytree(closed, out)
@@ -918,6 +982,17 @@ def test_gtsam_built_for_another_numpy_is_refused_before_it_crashes(tmp_path, mo
         'gtsam 4.2.2 does not work with NumPy 2.4.6: ')
     for versions['gtsam'], versions['numpy'] in (('4.2.2', '1.26.4'), ('4.3.0', '2.4.6')):
         assert libraries.problem_of('gtsam') == ''
+
+
+@pytest.mark.slow
+def test_warnings_of_the_replay_are_those_of_slam_too(drive, tmp_path):
+    """Ground truth with another clock gives no errors, and somebody has to say so."""
+    truth = tmp_path / 'truth.txt'
+    truth.write_text(''.join(f'{5000 + 0.1 * i} {0.25 * i} 0 0 0 0 0 1\n' for i in range(17)))
+    printed = djet('slam', drive, '--output', tmp_path / 'slam', '--poses', truth, *NO_LOOPS)
+    assert 'errors' not in json.loads((tmp_path / 'slam' / 'slam.json').read_text())
+    assert f'djet: warning: no errors were computed: the stamps of {truth} are' in printed.stderr
+    assert printed.stderr.count('djet: warning: ') == 1
 
 
 @pytest.mark.slow

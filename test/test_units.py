@@ -73,6 +73,27 @@ def test_the_unit_changes_where_no_length_carries_it_on(gap):
     assert log_units(N, edges) == pytest.approx(jumped, abs=0.01)
 
 
+def test_the_unit_drifts_where_lengths_are_least_known():
+    """Known to 12 % once and to 4 % everywhere else, however long."""
+    edges, _ = drifting(circles(), drift=0.0)
+    way = np.linalg.norm(edges[0].motion[:3, 3])
+
+    def known_to(edge, share, length):
+        along = length * unit(edge.motion[:3, 3])
+        motion = edge.motion.copy()
+        motion[:3, 3] = along
+        return replace(edge, motion=motion, covariance=np.diag(SIGMAS**2 * 1e-6) + np.pad(
+            share**2 * np.outer(along, along), (0, 3)))
+
+    chain = [known_to(edge, 0.12 if i == 44 else 0.04, way if i % 2 else way / 10)
+             for i, edge in enumerate(edges[:N - 1])]
+    found = log_units(N, [*chain, replace(edges[-1], source=N - 1, target=0,
+                                          log_scale_ratio=(-0.3, 1e-4))])
+    variances = np.full(N - 1, 0.04**2)
+    variances[44] = 0.12**2
+    assert np.diff(found) == pytest.approx(0.3 * variances / variances.sum(), rel=0.02)
+
+
 def test_outlier_scale_ratio_is_rejected():
     edges, units = drifting(circles(), wrong=(40,))
     assert log_units(N, edges) == pytest.approx(units, abs=0.04)
@@ -158,6 +179,24 @@ def test_scale_ratio_without_points_in_all_three_pairs():
     assert 0.1 < np.sqrt(np.mean(np.square(errors))) < 1
 
 
+def test_scale_ratio_at_the_end_of_a_short_loop_is_that_of_depths():
+    """A loop of two centimetres tells hardly any depth, but where the camera is."""
+    rng = np.random.default_rng(4)
+    K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
+    points = rng.uniform((-6, -3, 8), (6, 3, 30), (300, 3))
+    ways = np.array([[0.1, 0, 1.0], [0.02, 0.0, 0.0], [-0.1, 0, 1.2]])
+    lengths, near, far = np.linalg.norm(ways, axis=1), 0.5, 0.6
+    step, _ = pair(points, np.eye(3), ways[0], K)
+    loop, there = pair(points, rotation_exp(np.array([0.0, -0.05, 0.01])), ways[1], K)
+    other, _ = pair(there, np.eye(3), ways[2], K)
+    noisy = [replace(one, y_opt=one.y + 0.2 * rng.normal(size=one.y.shape))
+             for one in (step, loop, other)]
+    ratio, sigma = log_scale_ratio(noisy[0], lengths[0] / near, noisy[1], lengths[1] / near,
+                                   noisy[2], lengths[2] / far, K)
+    assert ratio == pytest.approx(np.log(far / near), abs=0.01)
+    assert sigma < 0.02
+
+
 def test_scale_ratio_from_depths():
     rng = np.random.default_rng(0)
     K = np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]])
@@ -211,10 +250,10 @@ def test_edges_of_a_removed_keyframe_are_rescaled_to_its_successor(monkeypatch):
             pass
 
         def links(self, current):
-            return [replace(edge, kind='link', source=current - 2, motion=rescaled_edge(
-                Edge(0, 1, np.linalg.inv(truth[current - 2]) @ truth[current], edge.covariance),
-                np.exp(-units[current - 2])).motion) for edge in edges[:N - 1]
-                if edge.target == current and current % 7 == 3]
+            return [replace(edge, kind='link', source=current - 5, motion=rescaled_edge(
+                Edge(0, 1, np.linalg.inv(truth[current - 5]) @ truth[current], edge.covariance),
+                np.exp(-units[current - 5])).motion) for edge in edges[:N - 1]
+                if edge.target == current and current % 7 == 3 and current > 5]
 
         def loops(self, current, units):
             return [edge for edge in edges[N - 1:] if edge.source == current]
@@ -231,6 +270,7 @@ def test_edges_of_a_removed_keyframe_are_rescaled_to_its_successor(monkeypatch):
         newest.pose, newest.factor = truth[i], float(np.exp(units[i]))
     assert (graph.first, graph.count('loop'), graph.count('odometry')) == (N - 40, 6, 39)
     assert graph.count('link') > 3
+    assert any(edge.kind == 'link' and edge.target - edge.source < 5 for edge in graph.edges)
     for edge in graph.edges:
         source, target = (graph.keyframes[end - graph.first] for end in (edge.source, edge.target))
         assert np.allclose(rescaled_edge(edge, source.factor).motion,
@@ -244,5 +284,9 @@ def test_first_remaining_keyframe_keeps_its_unit():
     graph = PoseGraph(np.arange(N), circles(), tuple(edges))
     one, ours = to_common_unit(graph), to_common_unit(graph, 1.5)
     assert ours[1] == pytest.approx(1.5 * one[1])
+    # unless that is the metre
+    metric = replace(graph, edges=(*edges[:N - 2], replace(edges[N - 2], metric=True),
+                                   *edges[N - 1:]))
+    assert np.array_equal(to_common_unit(metric, 1.5)[1], to_common_unit(metric)[1])
     for mine, theirs in zip(ours[0].edges, one[0].edges):
         assert np.allclose(mine.motion[:3, 3], 1.5 * theirs.motion[:3, 3])

@@ -116,7 +116,8 @@ def configuration(args: argparse.Namespace, *nodes: str, base: Config | None = N
 
 @contextmanager
 def opened_replay(args: argparse.Namespace, config: Config, recording: Path, folder: Path,
-                  draw: bool = False) -> Iterator[Callable[[], Outcome]]:
+                  draw: bool = False, derived: Iterable[Path] = ()
+                  ) -> Iterator[Callable[[], Outcome]]:
     """
     Open a recording with the topics and poses of the options; yield a function that replays it.
 
@@ -130,7 +131,7 @@ def opened_replay(args: argparse.Namespace, config: Config, recording: Path, fol
                         auxiliary={what: getattr(args, f'{what}_topic', None)
                                    for what in wanted}, damaged=True) as source:
         replay = Replay(source, config, str(recording), draw)
-        with ResultsFolder(folder, config, args.overwrite) as results, \
+        with ResultsFolder(folder, config, args.overwrite, derived) as results, \
                 progress_bar('replay', len(source)) as advance:
             yield partial(replay.run, results, advance)
 

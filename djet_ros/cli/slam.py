@@ -17,7 +17,7 @@ from djet_ros.config.yaml_files import load_yaml
 from djet_ros.errors import DjetError
 from djet_ros.libraries import problem_of
 from djet_ros.recordings.bags import is_bag
-from djet_ros.recordings.outputs import check_room, make_folder, make_room
+from djet_ros.recordings.outputs import check_room, make_folder, replaced_together
 from djet_ros.recordings.recording import open_recording, Recording
 from djet_ros.replay.graph_of_results import read_steps
 from djet_ros.replay.ground_truth import GroundTruth
@@ -64,12 +64,17 @@ def run(args: argparse.Namespace) -> int:
     else:
         config = configuration(args, NODE_NAME, GRAPH_NAME)
         results = args.output / 'replay'
-        with opened_replay(args, config, args.input, results) as replay:
-            # Earlier results of slam would not belong to the new replay.
-            make_room(args.output, FILES, args.overwrite)
+        # Earlier results of slam would not belong to the new replay.
+        with opened_replay(args, config, args.input, results,
+                           derived=[args.output / name for name in FILES]) as replay:
             outcome = replay()
-        if outcome.problem:
+        for line in outcome.advice:
+            warn(line)
+        if outcome.problem and not outcome.summary['frames']:
             raise DjetError(outcome.problem)
+        if outcome.problem:
+            # As of results: what could be replayed is used.
+            warn(outcome.problem)
     source, name = _source(results, args, config)
     try:
         steps = read_steps(results, warn)
@@ -79,8 +84,8 @@ def run(args: argparse.Namespace) -> int:
         truth = GroundTruth.of(source, warn).at(slam.frames.stamps_ns)
     finally:
         source.close()
-    make_room(args.output, FILES, args.overwrite)
-    summary = write_report(args.output, slam, truth, name, config)
+    with replaced_together(args.output, FILES, args.overwrite) as new:
+        summary = write_report(new, slam, truth, name, config)
     console().print(_table(summary))
     if summary['edges'].get('loop', 0) == summary['rejected'].get('loop', 0):
         print('no loop was closed: prefer before_tum.txt, the odometry, since the graph does '

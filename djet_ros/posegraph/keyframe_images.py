@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, MutableMapping
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import NamedTuple
@@ -51,6 +52,7 @@ class KeyframeFile(MutableMapping[int, KeyframeImage], Closing):
             for array in (frame.gray, frame.K, left_out,
                           *(getattr(image.features, name) for name in _FEATURES)):
                 np.save(self._file, array, allow_pickle=False)
+            self._file.flush()
         except OSError as error:
             raise DjetError('the images of keyframes could not be written to a temporary file: '
                             f'{error.strerror}; free disk space, or select fewer keyframes '
@@ -85,7 +87,9 @@ class KeyframeFile(MutableMapping[int, KeyframeImage], Closing):
 
     def close(self) -> None:
         """Close the file, which deletes it."""
-        self._file.close()
+        # It has what did not fit on the disk, and fails once more.
+        with suppress(OSError):
+            self._file.close()
 
 
 class _Kept(NamedTuple):

@@ -98,6 +98,14 @@ class KeyframeOffset(Motion):
         length = np.linalg.norm(self.motion[:3, 3])
         return bool(length >= config.keyframe_distance or turn >= config.keyframe_turn)
 
+    def motion_in_map(self, factor: float) -> Array:
+        """
+        Return the motion (4, 4) in the map's unit of length; factor: see ``Keyframe``.
+
+        Before the first metric edge that is the unit of the keyframe, but metres stay metres.
+        """
+        return self.motion if self.metric else rescaled_motion(self.motion, factor)
+
     def edge(self, target: int) -> Edge:
         """Return the edge to the frame as keyframe number target."""
         return Edge(self.keyframe, target, self.motion, self.covariance,
@@ -153,6 +161,8 @@ class KeyframeMap:
         self._searched = 0
         # Whether all lengths so far are in metres, so that there is no scale drift.
         self._metric = True
+        # Scale factor from the odometry's unit of length, as it is now, to that of the map.
+        self._factor = 1.0
 
     @property
     def edges(self) -> list[Edge]:
@@ -215,7 +225,9 @@ class KeyframeMap:
         before = self._newest_step
         if before is None:
             return
-        continues, factor = step.in_frame_of(before), self.keyframes[-1].factor
+        if step.metric and step.scale_known:
+            self._factor = 1.0
+        continues, factor = step.in_frame_of(before), self._factor
         if continues and factor == 1.0:
             return
         motion = np.linalg.inv(before.pose) @ step.pose if continues else np.eye(4)
@@ -239,8 +251,7 @@ class KeyframeMap:
         before = None if offset is None else offset.edge(number)
         if before is not None:
             self._chain.append(before)
-        factor = self.keyframes[-1].factor if self.keyframes else 1.0
-        self.keyframes.append(Keyframe(step.stamp_ns, self.correction @ step.pose, factor))
+        self.keyframes.append(Keyframe(step.stamp_ns, self.correction @ step.pose, self._factor))
         self._pending.append(_Pending(frame, before, step.camera_correction))
         if self._max_keyframes is not None and len(self.keyframes) > self._max_keyframes:
             self._forget_oldest()
@@ -277,10 +288,10 @@ class KeyframeMap:
                                           optimised.factors.tolist()):
             keyframe.pose, keyframe.factor = pose, factor
         self.rejected_loops = optimised.rejected('loop')
-        newest = self.newest.keyframe - self.first
-        newest_pose = self.keyframes[newest].pose @ rescaled_motion(
-            self.newest.motion, float(optimised.factors[newest]))
-        self.correction = newest_pose @ np.linalg.inv(self._newest_step.pose)
+        newest = self.keyframes[self.newest.keyframe - self.first]
+        self._factor = 1.0 if self.newest.metric else newest.factor
+        self.correction = (newest.pose @ self.newest.motion_in_map(newest.factor)
+                           @ np.linalg.inv(self._newest_step.pose))
         self.optimisations += 1
         return optimised
 

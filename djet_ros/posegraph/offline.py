@@ -15,7 +15,6 @@ from djet_ros.posegraph.keyframe_map import KeyframeMap, KeyframeOffset
 from djet_ros.posegraph.pose_graph import PoseGraph
 from djet_ros.posegraph.recorded_frames import frame_finder
 from djet_ros.posegraph.steps import graph_of, scale_of, Step
-from djet_ros.posegraph.units import rescaled_motion
 from djet_ros.recordings.recording import Recording
 import numpy as np
 
@@ -42,8 +41,9 @@ class Slam:
     def optimised_poses(self) -> Array:
         """Return the optimised poses (N, 4, 4) of all frames, each fixed in its keyframe."""
         keyframes, factors = self.optimised.graph.poses, self.optimised.factors
-        return np.array([keyframes[offset.keyframe] @ rescaled_motion(
-            offset.motion, factors[offset.keyframe]) for offset in self.offsets])
+        return np.array([
+            keyframes[offset.keyframe] @ offset.motion_in_map(factors[offset.keyframe])
+            for offset in self.offsets])
 
 
 def run_slam(steps: Sequence[Step], recording: Recording, config: Config,

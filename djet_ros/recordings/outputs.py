@@ -15,6 +15,7 @@ import shutil
 from tempfile import mkdtemp, TemporaryDirectory
 
 from djet_ros.errors import DjetError
+from djet_ros.interrupts import interrupt_after
 
 
 def check_file(path: Path, overwrite: bool, *suffixes: str, inputs: Iterable[Path] = ()) -> None:
@@ -50,6 +51,23 @@ def make_room(folder: Path, ours: Collection[str], overwrite: bool,
         else:
             path.unlink()
     make_folder(folder)
+
+
+@contextmanager
+def replaced_together(folder: Path, ours: Collection[str], overwrite: bool) -> Iterator[Path]:
+    """
+    Yield a temporary folder, whose files replace those of an earlier run once all are written.
+
+    On failure the earlier ones are kept. Arguments and errors are those of ``make_room``.
+    """
+    check_room(folder, ours, overwrite)
+    make_folder(folder)
+    with TemporaryDirectory(prefix='.djet-', dir=folder) as scratch:
+        yield Path(scratch)
+        with interrupt_after():
+            make_room(folder, ours, overwrite)
+            for path in Path(scratch).iterdir():
+                path.rename(folder / path.name)
 
 
 class SetAside:

@@ -14,7 +14,7 @@ The results folder of a replay; files are written during the run, so that nothin
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, ExitStack, suppress
 import csv
 import json
@@ -68,14 +68,17 @@ class ResultsFolder(Closing):
     Writes the results of one replay; a context manager.
 
     Until ``finish`` the summary marks the run as incomplete. Earlier results are set aside, and
-    put back at the end if the new ones have no frame. Raises DjetError if the folder exists
+    put back at the end if the new ones have no frame. derived: files elsewhere that were made of
+    earlier results; they are removed with them. Raises DjetError if the folder exists
     (unless it is empty, or an earlier results folder and overwrite is set), cannot be written, or
     is that of a replay that still runs.
     """
 
-    def __init__(self, path: Path, config: Config, overwrite: bool = False) -> None:
+    def __init__(self, path: Path, config: Config, overwrite: bool = False,
+                 derived: Iterable[Path] = ()) -> None:
         """Create the folder and its files, and write the parameters."""
         self.path = path
+        self._derived = [*derived]
         present = path.exists()
         with self._beginning():
             if is_locked(path / _TABLE):
@@ -128,6 +131,8 @@ class ResultsFolder(Closing):
         """Write the result of a processed image (number from 0) and its processing time."""
         try:
             self._earlier.give_up()
+            while self._derived:
+                self._derived.pop().unlink(missing_ok=True)
         except OSError as error:
             raise _blame(self.path, error) from error
         for trajectory in self._trajectories:
