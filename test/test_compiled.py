@@ -503,10 +503,10 @@ SOURCES = Path(__file__).parents[1] / 'djet_ros' / 'compiled'
 CHECKED = f"""
 import ctypes
 from djet_ros import compiled
-compiled.library = ctypes.CDLL('checked.so')
+compiled.library = ctypes.CDLL('./checked.so')
 import pytest, sys
 others = ' and not '.join(['not pairs', 'track', 'odometries', 'disabled'])
-sys.exit(pytest.main(['-qx', '-p', 'no:cacheprovider', '-m', 'not slow', '-k', others,
+sys.exit(pytest.main(['-qsx', '-p', 'no:cacheprovider', '-m', 'not slow', '-k', others,
                       {__file__!r}]))
 """
 
