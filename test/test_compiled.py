@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache, partial
 from itertools import pairwise
 import os
 from pathlib import Path
+import shutil
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -28,8 +30,8 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import preset
 from djet_ros.core.features import most_similar
 from djet_ros.core.geometry import fit_rotation, rotation_exp, rotation_log
-from djet_ros.core.graded import graded_surfaces, smooth_finely, warped_grades
-from djet_ros.core.hamming import dense_descriptors, match_distances
+from djet_ros.core.graded import graded_surfaces, grades, smooth_finely, warped_grades
+from djet_ros.core.hamming import dense_descriptors, intensities, match_distances
 from djet_ros.core.jet import epipolar_residuals, jet_problem, JetProblem, Loss, minimise
 from djet_ros.core.orb_pattern import pattern, reach
 from djet_ros.core.paraboloid import Paraboloids
@@ -40,6 +42,7 @@ from djet_ros.core.slants import planes_at
 from djet_ros.core.starts import starts_around
 from djet_ros.core.types import Pose, Status
 from djet_ros.lab.scenes import make_scene
+from djet_ros.lab.surface_steps import RADIUS
 from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.result import OdometryResult
 from djet_ros.odometry.visual_odometry import VisualOdometry
@@ -142,7 +145,8 @@ def test_patches_of_several_images_equal_those_of_each(counts: tuple[int, ...]) 
 
 
 @pytest.mark.parametrize('count', [0, 1, 7, 16, 17, 400])
-@pytest.mark.parametrize('radius', [1, 2, 7])
+# The largest window of a configuration, and the window that is drawn.
+@pytest.mark.parametrize('radius', [1, 2, 7, RADIUS])
 @pytest.mark.parametrize(('tests', 'scale', 'grading'), [(96, 0.65, 48.0), (256, 1.0, 120.0),
                                                          (16, 0.3, 0.2)])
 def test_surfaces_are_those_of_numpy_to_the_last_bit(
@@ -212,6 +216,63 @@ def test_the_nearest_points_are_those_of_numpy(count: int, spread: tuple[int, in
     np.testing.assert_array_equal(*off)
 
 
+@pytest.mark.parametrize('count', [3, 700])
+def test_nothing_is_near_a_point_without_a_place(count: int) -> None:
+    points = np.random.default_rng(count).uniform(0, 90, (count, 2))
+    points[::2], points[2, 1] = np.inf, np.nan
+    assert (nearest(points, points[1::2]) == np.arange(1, count, 2)).all()
+
+
+def test_points_closer_than_numbers_can_square_are_all_near() -> None:
+    points = np.random.default_rng(0).uniform(0, 1e-170, (700, 2))
+    found = nearest(points, points)
+    assert ((found >= 0) & (found < 700)).all()
+
+
+# Of which many tests, slopes and neighbours are equal, or as different as can be.
+DEGENERATE = {
+    'flat': np.full((60, 70), 7, np.uint8),
+    'white noise': 255 * np.random.default_rng(0).integers(0, 2, (60, 70)).astype(np.uint8),
+    'stripes': np.tile(np.repeat([0, 255, 255], 7).astype(np.uint8), (61, 4)),
+    'chequers': (255 * (np.indices((60, 71)) // 8).sum(0) % 510).astype(np.uint8),
+    'a dot': np.pad(np.full((1, 1), 255, np.uint8), 30)}
+
+
+@pytest.mark.parametrize('name', DEGENERATE)
+def test_degenerate_images_are_seen_as_numpy_does(name: str) -> None:
+    # Neither in order nor writable.
+    gray = DEGENERATE[name].T
+    gray.setflags(write=False)
+    slopes, _ = corner_slopes(gray)
+    peaks, _ = _peaks(slopes, 0.0, gray.shape)
+    fine, chosen = smooth_finely(gray, 0.65), pattern(96, 0.65)
+    pixels = np.array([[30, 28], [30, 30], [31, 29]])
+    for work in (partial(corner_slopes, gray), partial(image_noise, gray),
+                 partial(_peaks, slopes, 0.0, gray.shape), partial(_exact_peaks, slopes, peaks),
+                 partial(dense_descriptors, gray, pixels),
+                 partial(graded_surfaces, grades(*intensities(fine, pixels, chosen), 48.0), fine,
+                         pixels[::-1], 2, 48.0, chosen)):
+        np.testing.assert_equal(*both(work))
+
+
+def test_images_of_one_row_are_seen_through_warps() -> None:
+    fine, points = np.arange(40, dtype=np.int16)[None], np.array([[3.0, 0], [39, 1], [50, -9]])
+    warp = warps(np.random.default_rng(0), 3)
+    for strip in (fine, fine.T):
+        np.testing.assert_array_equal(*both(partial(
+            warped_grades, warp, [(strip, 3)], points, 48.0, 1.0, pattern(96, 0.65))))
+        align_all([(strip.astype(np.uint8), 3)], points, warp, image(0), points + 50)
+
+
+def test_places_outside_all_images_have_no_distance() -> None:
+    far = [np.nan, np.inf, -np.inf, 1e300, -1e300, 2.0**31, 2.0**63, -0.5, 12.5, 13.0, 50.0]
+    x = np.stack(np.meshgrid(far, far), axis=-1).reshape(-1, 2)
+    with np.errstate(invalid='ignore'):
+        ours, numpys = both(lambda: match_distances(image(2), x, image(3), x[:, ::-1]))
+    np.testing.assert_array_equal(ours, numpys)
+    assert 0 < np.isfinite(ours).sum() < len(x)
+
+
 def test_descriptors_are_those_of_numpy_to_the_last_bit() -> None:
     there, here, rng = image(2), image(3), np.random.default_rng(2)
     x, y = rng.uniform((-9, -9), (330, 210), (2, 400, 2))
@@ -232,6 +293,12 @@ def test_the_most_similar_features_are_those_of_numpy(strips: list[tuple[int, ..
     assert (ours[0] >= 0).sum() == (70 if strips else 0)
     for mine, others in zip(ours[1:], numpys[1:]):
         np.testing.assert_allclose(mine, others, atol=1e-4)
+
+
+def test_of_features_that_look_alike_the_first_is_the_most_similar() -> None:
+    alike = np.zeros((9, 32), np.uint8), np.ones((9, 2))
+    for ours in both(lambda: most_similar(np.array([[0, 5, 4, 9], [3, 9, 0, 9]]), alike, alike)):
+        assert ours[0].tolist() == [4, 4, 4, 4, 4, 0, 0, 0, 0]
 
 
 @pytest.mark.parametrize('count', [1, 9, 900])
@@ -416,6 +483,57 @@ def test_a_track_differs_by_less_than_its_sigma(frames: list[Frame], name: str) 
         if ours.status == Status.OK:
             # Preset paper does not use the flow.
             assert apart_by(ours, numpys) < (1e-3 if name == 'paper' else 0.5)
+
+
+def test_two_odometries_in_two_threads_estimate_what_each_does_alone() -> None:
+    drives = [[Frame(gray, K, 10**8 * (i + 1)) for i, gray in enumerate(images)]
+              for images, K in (rendered('road'), rendered('handheld'))]
+    with ThreadPoolExecutor(2) as pool:
+        together = list(pool.map(partial(motions, name='best'), drives))
+    for drive, in_company in zip(drives, together):
+        for alone, other in zip(motions(drive, 'best'), in_company, strict=True):
+            assert alone.status == other.status
+            np.testing.assert_array_equal(alone.pose, other.pose)
+            np.testing.assert_array_equal(alone.motion_covariance, other.motion_covariance)
+
+
+SOURCES = Path(__file__).parents[1] / 'djet_ros' / 'compiled'
+
+# The tests above of single functions, with another build of them.
+CHECKED = f"""
+import ctypes
+from djet_ros import compiled
+compiled.library = ctypes.CDLL('./checked.so')
+import pytest, sys
+others = ' and not '.join(['not pairs', 'track', 'odometries', 'disabled'])
+sys.exit(pytest.main(['-qsx', '-p', 'no:cacheprovider', '-m', 'not slow', '-k', others,
+                      {__file__!r}]))
+"""
+
+
+@cache
+def sanitizers() -> list[str]:
+    """Return the libraries that find accesses outside of arrays; none without GCC's."""
+    if shutil.which('gcc') is None:
+        return []
+    paths = [subprocess.run(['gcc', f'-print-file-name={name}'], capture_output=True, text=True,
+                            check=True).stdout.strip()
+             for name in ('libasan.so', 'libubsan.so', 'libstdc++.so')]
+    return paths if all(map(os.path.isabs, paths)) else []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not sanitizers(), reason='needs GCC with its sanitizers')
+def test_compiled_loops_stay_within_their_arrays(tmp_path: Path) -> None:
+    subprocess.run(['gcc', '-shared', '-fPIC', '-O1', '-g', '-ffp-contract=off',
+                    '-fsanitize=address,undefined,float-cast-overflow', '-fno-sanitize-recover',
+                    '-Wno-psabi', *map(str, SOURCES.glob('*.c')), '-o', 'checked.so', '-lm'],
+                   cwd=tmp_path, check=True)
+    done = subprocess.run(
+        [sys.executable, '-c', CHECKED], cwd=tmp_path, capture_output=True, text=True,
+        env={**os.environ, 'LD_PRELOAD': ' '.join(sanitizers()), 'PYTHONMALLOC': 'malloc',
+             'ASAN_OPTIONS': 'detect_leaks=0'})
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
 
 
 def test_a_build_of_other_sources_is_ignored(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,7 +27,7 @@ Images = Sequence[tuple[NDArray[Any], int]]
 
 # Version of the C interface, see interface.c: an editable install may have newer sources than its
 # build.
-_INTERFACE = 12
+_INTERFACE = 13
 
 _NO_BYTES = c_char * 0
 _FLOAT64 = np.dtype(np.float64)
@@ -37,6 +37,9 @@ _ROWS, _PADDING = 28, 3
 
 # Rows of scratch memory for corner slopes, and for planes in squares.
 _CORNER_ROWS, _PLANE_ROWS = 12, 14
+
+# Radius of the largest windows that `graded_surfaces` has room for, as in surfaces.c.
+MOST_RADIUS = 7
 
 # Terms summed over the matches of a cell.
 _TERMS = 27
@@ -117,7 +120,8 @@ def graded_surfaces(reference: NDArray[np.int16], image: NDArray[np.int16],
     Return distances (P, P, N) of graded tests, P = 2 radius + 1: `core.graded.graded_surfaces`.
 
     reference: (T, N); centres: (N, 2) pixels of the image (H, W), with room for windows and tests
-    (T, 4), which reach at most `far` pixels; reach: the largest grade.
+    (T, 4), which reach at most `far` pixels; radius: at most MOST_RADIUS; reach: the largest
+    grade.
     """
     n, side = len(centres), 2 * radius + 1
     distances = np.empty((side, side, n), np.float32)

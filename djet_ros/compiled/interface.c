@@ -1,5 +1,5 @@
 /* Version of the functions' signatures: change it with them, here and in __init__.py. */
 int djet_interface(void)
 {
-    return 12;
+    return 13;
 }

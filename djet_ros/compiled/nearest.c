@@ -22,9 +22,11 @@ static Cells cells_around(int n, const double (*points)[2])
     /* No more than (n + 1) of them along each axis, and 3 n + 1 in all. */
     double side = fmax(sqrt(width * height / n), fmax(width, height) / n);
     side = side > 0 ? side : 1;
-    const Cells cells = {least[0], least[1], side, (int)(width / side) + 1,
-                         (int)(height / side) + 1};
-    return cells;
+    const double columns = floor(width / side) + 1, rows = floor(height / side) + 1;
+    /* All in one cell if numbers have overflowed, or the area has vanished. */
+    if (!(columns * rows <= 3.0 * n + 1))
+        return (Cells){least[0], least[1], INFINITY, 1, 1};
+    return (Cells){least[0], least[1], side, (int)columns, (int)rows};
 }
 
 /* The cell of a position in units of cells, the nearest one outside of all `count`. */

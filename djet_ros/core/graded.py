@@ -16,6 +16,7 @@ import cv2
 from djet_ros import compiled
 from djet_ros.core.hamming import (
     endpoints_of,
+    have_neighbours,
     Image,
     ImagePoints,
     invert_warps,
@@ -68,7 +69,7 @@ def warped_grades(warp: Array, images: Sequence[ImagePoints], points: Array, gra
 
     contrast: as in `grades`.
     """
-    if compiled.library is None:
+    if compiled.library is None or not have_neighbours(images):
         return grades(*warped_intensities(warp, images, points, tests), grading, contrast)
     inverse, nearer, is_bent = invert_warps(warp, tests)
     nearer[~is_bent] = 0
@@ -95,7 +96,7 @@ def graded_surfaces(reference: Grades, fine: Grades, centres: Pixels, radius: in
     radius, v_x + radius, k]. Raises ValueError if a window does not fit into the image.
     """
     reach = _largest_grade(grading)
-    if compiled.library is not None:
+    if compiled.library is not None and radius <= compiled.MOST_RADIUS:
         require_describable(centres, fine, radius, tests)
         return compiled.graded_surfaces(reference, fine, centres, radius, tests, reach_of(tests),
                                         reach)

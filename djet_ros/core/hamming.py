@@ -172,6 +172,11 @@ def passes(images: Sequence[ImagePoints]) -> list[tuple[list[ImagePoints], slice
     return grouped
 
 
+def have_neighbours(images: Sequence[ImagePoints]) -> bool:
+    """Return whether images have two rows and columns, as compiled loops need."""
+    return all(min(image.shape) > 1 for image, _ in images)
+
+
 def endpoints_of(tests: Tests) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Return the distinct points (2, E) of tests (T, 4), and the indices (2, T) of their ends."""
     return _ends(tests.tobytes())

@@ -14,7 +14,15 @@ from typing import Any, NamedTuple
 import cv2
 from djet_ros import compiled
 from djet_ros.core.geometry import inverses
-from djet_ros.core.hamming import blocks, floating, gather_patches, Image, ImagePoints, passes
+from djet_ros.core.hamming import (
+    blocks,
+    floating,
+    gather_patches,
+    have_neighbours,
+    Image,
+    ImagePoints,
+    passes,
+)
 from djet_ros.core.paraboloid import times
 from djet_ros.core.parallel import map_parallel
 from djet_ros.core.types import Array
@@ -106,7 +114,8 @@ def align_all(images: Sequence[ImagePoints], x: Array, warp: Array, current: Ima
     inside = within(y, current.shape, _MARGIN)
     # Patches near the border are aligned elsewhere, and their result is discarded.
     start = np.where(inside[:, None], y, _MARGIN)
-    if compiled.library is None or min(current.shape) <= 2 * _MARGIN or not len(x):
+    if (compiled.library is None or min(current.shape) <= 2 * _MARGIN or not len(x)
+            or not have_neighbours(images)):
         places, noise, spread = templates(images, x, warp).align(current, start, inside)
     else:
         places, noise, spread = _stepped(images, x, warp, current, start, inside)
