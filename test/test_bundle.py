@@ -15,6 +15,7 @@ from djet_ros.core.bundle import (
 )
 from djet_ros.core.correction import Correction
 from djet_ros.core.geometry import rays, rotation_exp
+from djet_ros.core.joint_problem import JointProblem
 from djet_ros.core.radial import distort
 import numpy as np
 import pytest
@@ -346,3 +347,58 @@ def test_a_frame_without_information_comes_and_goes_without_effect_on_a_prior():
     left = prior.with_frame(np.eye(3), np.ones(3)).without_frame(2)
     assert np.allclose(left.H, prior.H, rtol=1e-9)
     assert left.g == pytest.approx(prior.g)
+
+
+def refined(wrong, noise, count, seed=0, frames=4):
+    """Return poses and landmarks after they have adapted to a camera that deviates."""
+    rng, deviation = np.random.default_rng(seed), Correction(*wrong)
+    poses, landmarks = scene(rng, frames, count)
+    # Rotations about several axes determine the camera.
+    poses = poses.moved(np.random.default_rng(25).normal(size=6 * frames) * 0.15)
+    landmarks.roots[:], landmarks.anchor_roots[:] = np.eye(2), np.eye(2)
+
+    def seen(places):
+        there = deviation.camera_matrix(K)
+        return (distort(there, projected(there, places), deviation.k1)
+                + noise * rng.normal(size=(count, 2)))
+
+    for frame in range(frames):
+        landmarks.minima[:, frame] = seen(points_in_frame(K, poses, landmarks, frame))
+    landmarks.anchor_pixels = seen(rays(K, landmarks.points))
+    landmarks.points = landmarks.anchor_pixels.copy()
+    # The first pose, and the length of the way to the second, are the gauge.
+    prior = PosePrior.holding(Poses(poses.R[:1], poses.t[:1]))
+    for R, t in zip(poses.R[1:], poses.t[1:]):
+        prior = prior.with_frame(R, t)
+    prior.H[4 + 11, 4 + 11] = 1e10
+    problem = JointProblem(K, poses, landmarks, prior)
+    for _ in range(4):
+        problem.refine()
+    return problem
+
+
+@pytest.mark.parametrize('wrong', [(1e-3, 0, 0, 0), (0, 3e-4, 0, 0), (2e-4, 1e-4, -1e-4, 1e-4)])
+def test_a_deviation_of_the_camera_leaves_the_mean_square_that_is_said_of_it(wrong):
+    """In pixels, per observation, after poses and landmarks have adapted."""
+    problem = refined(wrong, 0.0, 300)
+    observed = observe(K, problem.poses, problem.landmarks)
+    left = ((observed.residuals**2).sum() + (observed.anchor_residuals**2).sum()) / len(
+        observed.residuals)
+    H = refined(np.zeros(4), 0.0, 300).camera_information(1).H
+    assert left == pytest.approx(np.array(wrong) @ H @ wrong, rel=0.05)
+
+
+def test_observations_tell_how_the_camera_deviates_whatever_the_robust_loss_flattens():
+    told = refined((0.02, 0, 0, 0), 0.3, 10_000).camera_information(1)
+    assert -np.linalg.solve(told.H, told.g)[0] == pytest.approx(0.02, rel=0.1)
+
+
+@pytest.mark.parametrize('windows', [1, 6])
+def test_observations_that_several_windows_share_are_as_uncertain_as_if_each_had_its_part(windows):
+    """A robust loss takes them for at most twice as uncertain as they are."""
+    wrong, squares = np.array([4e-3, 1e-3, -1e-3, 1e-3]), []
+    for seed in range(24):
+        told = refined(wrong, 0.3, 300, seed).camera_information(windows)
+        off = np.linalg.solve(told.H, told.g) + wrong
+        squares.append(off @ told.H @ off / told.noise)
+    assert 0.5 < windows * np.mean(squares) / 4 < 1.2
