@@ -431,6 +431,30 @@ def test_the_cost_that_no_step_may_increase_is_the_one_whose_slope_is_solved_for
     assert (cost(1e-3) - cost(-1e-3)) / 2e-3 == pytest.approx(slope, rel=1e-3)
 
 
+@pytest.mark.parametrize('by_prior', [False, True])
+@pytest.mark.parametrize(('factor', 'taken'), [(1, 1), (3, 3 / 2), (6, 3 / 2), (-1, 0)])
+def test_a_step_that_would_increase_the_cost_is_halved_or_not_taken(factor, taken, by_prior):
+    """Whether observations want poses elsewhere, or a prior against what is observed."""
+    problem, rng = refined(np.zeros(4), 0.02, 60), np.random.default_rng(9)
+    off = 2e-4 * rng.normal(size=24) * [*[0] * 12, *[1] * 12]
+    if by_prior:
+        problem.prior.H[4:, 4:] += 1e8 * np.eye(24)
+        problem.prior.g[4:] = 1e8 * off - problem.prior.H[4:, 4:] @ problem.poses.step_from(
+            problem.prior.linearised_at)
+    else:
+        problem.poses = problem.poses.moved(off)
+    observed, prior = problem._observed(), problem.prior.at(problem.poses)
+    reduced = problem._reduced(observed)
+    step = -np.linalg.solve(problem.prior.of_poses + reduced.H[4:, 4:],
+                            prior.gradient + reduced.g[4:])
+    change, before, scale = reduced.change(with_camera(step)), problem.poses, problem.scale
+    landmarks = problem.landmarks
+    problem._line_search(observed, prior, factor * step, factor * change)
+    assert problem.poses.step_from(before) == pytest.approx(taken * step, rel=1e-2, abs=1e-8)
+    assert problem.landmarks.points - landmarks.points == pytest.approx(taken * change[:, 1:])
+    assert taken or problem.scale == scale
+
+
 def test_the_newest_length_depends_on_the_camera_as_a_correction_then_changes_it():
     problem = refined((2e-3, 1e-3, 1e-3, -1e-3), 0.05, 200)
     dependence, before = problem.length_by_camera.copy(), problem.newest_length
