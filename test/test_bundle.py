@@ -13,9 +13,11 @@ from djet_ros.core.bundle import (
     Poses,
     projected,
 )
-from djet_ros.core.correction import Correction
-from djet_ros.core.geometry import rays, rotation_exp
+from djet_ros.core.correction import Correction, motion_shift
+from djet_ros.core.geometry import rays, rotation_exp, rotation_log, sphere_tangents, unit
+from djet_ros.core.joint_problem import JointProblem
 from djet_ros.core.radial import distort
+from djet_ros.core.types import RelativePose, Status
 import numpy as np
 import pytest
 
@@ -346,3 +348,167 @@ def test_a_frame_without_information_comes_and_goes_without_effect_on_a_prior():
     left = prior.with_frame(np.eye(3), np.ones(3)).without_frame(2)
     assert np.allclose(left.H, prior.H, rtol=1e-9)
     assert left.g == pytest.approx(prior.g)
+
+
+def refined(wrong, noise, count, seed=0, frames=4):
+    """Return poses and landmarks after they have adapted to a camera that deviates."""
+    rng, deviation = np.random.default_rng(seed), Correction(*wrong)
+    poses, landmarks = scene(rng, frames, count)
+    # Rotations about several axes determine the camera.
+    poses = poses.moved(np.random.default_rng(25).normal(size=6 * frames) * 0.15)
+    landmarks.roots[:], landmarks.anchor_roots[:] = np.eye(2), np.eye(2)
+
+    def seen(places):
+        there = deviation.camera_matrix(K)
+        return (distort(there, projected(there, places), deviation.k1)
+                + noise * rng.normal(size=(count, 2)))
+
+    for frame in range(frames):
+        landmarks.minima[:, frame] = seen(points_in_frame(K, poses, landmarks, frame))
+    landmarks.anchor_pixels = seen(rays(K, landmarks.points))
+    landmarks.points = landmarks.anchor_pixels.copy()
+    # The first pose, and the length of the way to the second, are the gauge.
+    prior = PosePrior.holding(Poses(poses.R[:1], poses.t[:1]))
+    for R, t in zip(poses.R[1:], poses.t[1:]):
+        prior = prior.with_frame(R, t)
+    prior.H[4 + 11, 4 + 11] = 1e10
+    problem = JointProblem(K, poses, landmarks, prior)
+    for _ in range(4):
+        problem.refine()
+    return problem
+
+
+@pytest.mark.parametrize('wrong', [(1e-3, 0, 0, 0), (0, 3e-4, 0, 0), (2e-4, 1e-4, -1e-4, 1e-4)])
+def test_a_deviation_of_the_camera_leaves_the_mean_square_that_is_said_of_it(wrong):
+    """In pixels, per observation, after poses and landmarks have adapted."""
+    problem = refined(wrong, 0.0, 300)
+    observed = observe(K, problem.poses, problem.landmarks)
+    left = ((observed.residuals**2).sum() + (observed.anchor_residuals**2).sum()) / len(
+        observed.residuals)
+    H = refined(np.zeros(4), 0.0, 300).camera_information(1).H
+    assert left == pytest.approx(np.array(wrong) @ H @ wrong, rel=0.05)
+
+
+def test_observations_tell_how_the_camera_deviates_whatever_the_robust_loss_flattens():
+    told = refined((0.02, 0, 0, 0), 0.3, 10_000).camera_information(1)
+    assert -np.linalg.solve(told.H, told.g)[0] == pytest.approx(0.02, rel=0.1)
+
+
+@pytest.mark.parametrize('windows', [1, 6])
+def test_observations_that_several_windows_share_are_as_uncertain_as_if_each_had_its_part(windows):
+    """A robust loss takes them for at most twice as uncertain as they are."""
+    wrong, squares = np.array([4e-3, 1e-3, -1e-3, 1e-3]), []
+    for seed in range(24):
+        told = refined(wrong, 0.3, 300, seed).camera_information(windows)
+        off = np.linalg.solve(told.H, told.g) + wrong
+        squares.append(off @ told.H @ off / told.noise)
+    assert 0.5 < windows * np.mean(squares) / 4 < 1.2
+
+
+def test_the_cost_that_no_step_may_increase_is_the_one_whose_slope_is_solved_for():
+    """Of observations with a robust loss, anchors, and a prior, in one unit."""
+    problem, rng = refined(np.zeros(4), 0.3, 60), np.random.default_rng(9)
+    prior = random_prior(rng, 4)
+    # Steps such that each part counts.
+    problem.prior = PosePrior(1e4 * prior.H, 1e4 * prior.g, problem.poses)
+    problem.scale = 0.4
+    poses, landmarks = problem.poses.moved(1e-4 * rng.normal(size=24)), problem.landmarks
+    step = 1e-4 * rng.normal(size=24)
+    change = rng.normal(size=(len(landmarks), 3)) * [1e-4, 1, 1]
+
+    def cost(share):
+        moved = poses.moved(share * step)
+        observed = observe(K, moved, landmarks.moved(share * change))
+        return problem._cost(observed, problem.scale) + problem.prior.at(moved).cost
+
+    observed = observe(K, poses, landmarks)
+    reduced = problem._reduced(observed)
+    # Landmarks at rest: the slope by poses alone is that of the equations before elimination.
+    by_landmarks = np.einsum('ni,ni->', reduced._slopes, change)
+    gain = np.einsum('nij,njk->nik', reduced._variances, reduced._coupling)
+    by_poses = reduced.g + np.einsum('nik,ni->k', gain, reduced._slopes)
+    slope = by_poses[4:] @ step + by_landmarks + problem.prior.at(poses).gradient @ step
+    assert (cost(1e-3) - cost(-1e-3)) / 2e-3 == pytest.approx(slope, rel=1e-3)
+
+
+@pytest.mark.parametrize('by_prior', [False, True])
+@pytest.mark.parametrize(('factor', 'taken'), [(1, 1), (3, 3 / 2), (6, 3 / 2), (-1, 0)])
+def test_a_step_that_would_increase_the_cost_is_halved_or_not_taken(factor, taken, by_prior):
+    """Whether observations want poses elsewhere, or a prior against what is observed."""
+    problem, rng = refined(np.zeros(4), 0.02, 60), np.random.default_rng(9)
+    off = 2e-4 * rng.normal(size=24) * [*[0] * 12, *[1] * 12]
+    if by_prior:
+        problem.prior.H[4:, 4:] += 1e8 * np.eye(24)
+        problem.prior.g[4:] = 1e8 * off - problem.prior.H[4:, 4:] @ problem.poses.step_from(
+            problem.prior.linearised_at)
+    else:
+        problem.poses = problem.poses.moved(off)
+    observed, prior = problem._observed(), problem.prior.at(problem.poses)
+    reduced = problem._reduced(observed)
+    step = -np.linalg.solve(problem.prior.of_poses + reduced.H[4:, 4:],
+                            prior.gradient + reduced.g[4:])
+    change, before, scale = reduced.change(with_camera(step)), problem.poses, problem.scale
+    landmarks = problem.landmarks
+    problem._line_search(observed, prior, factor * step, factor * change)
+    assert problem.poses.step_from(before) == pytest.approx(taken * step, rel=1e-2, abs=1e-8)
+    assert problem.landmarks.points - landmarks.points == pytest.approx(taken * change[:, 1:])
+    assert taken or problem.scale == scale
+
+
+def test_the_newest_length_depends_on_the_camera_as_a_correction_then_changes_it():
+    problem = refined((2e-3, 1e-3, 1e-3, -1e-3), 0.05, 200)
+    dependence, before = problem.length_by_camera.copy(), problem.newest_length
+    assert np.abs(dependence).min() > 1e-3
+    for change in 1e-4 * np.eye(4):
+        changed = replace(problem)
+        changed.adapt_to(change)
+        assert np.log(changed.newest_length / before) == pytest.approx(
+            dependence @ change, rel=0.05, abs=1e-7)
+
+
+def of_pair(length, expected, sigma, by_camera):
+    """Return a problem with a pair whose length depends on the camera, the pair and a pose."""
+    rng = np.random.default_rng(31)
+    half, x = rng.normal(size=(5, 5)), rng.uniform((100, 80), (540, 400), (50, 2))
+    pair = RelativePose(
+        Status.OK, rotation_exp(np.array([0.02, -0.1, 0.05])), unit(np.array([0.3, -0.1, 0.9])),
+        1e-4 * (half @ half.T + np.eye(5)), x=x, y=x, y_opt=x + 5, inliers=np.ones(50, bool))
+    first = Poses(rotation_exp(np.array([[0.1, 0.2, 0.3]])), np.array([[1.0, 2, 3]]))
+    prior = PosePrior(np.zeros((10, 10)), np.zeros(10), first)
+    problem = JointProblem(K, first, Landmarks.at(np.empty((0, 2)), np.empty(0), 0, 1), prior,
+                           length_by_camera=by_camera)
+    problem.add_frame(pair.R @ first.R[0], pair.R @ first.t[0] + length * pair.t)
+    problem.add_pair(pair, length, expected, sigma)
+    return problem, pair
+
+
+def test_a_pair_costs_what_poses_deviate_from_its_rotation_direction_and_expected_length():
+    expected, sigma = 2.3, 0.1
+    problem, pair = of_pair(2.5, expected, sigma, np.zeros(4))
+
+    def cost(poses):
+        motion, shift = (motions[1, 0] for motions in poses.relative_motions)
+        off = np.concatenate([rotation_log(motion @ pair.R.T),
+                              sphere_tangents(pair.t).T @ (unit(shift) - pair.t)])
+        return (off @ np.linalg.solve(pair.covariance_5, off)
+                + ((np.linalg.norm(shift) - expected) / sigma)**2) / 2
+
+    for seed in range(5):
+        moved = problem.poses.moved(1e-4 * np.random.default_rng(seed).normal(size=12))
+        said = problem.prior.at(moved).cost - problem.prior.at(problem.poses).cost
+        assert said == pytest.approx(cost(moved) - cost(problem.poses), rel=2e-3, abs=1e-7)
+
+
+@pytest.mark.parametrize('field', range(4))
+def test_another_camera_moves_a_pair_as_its_matches_and_a_length_as_those_before(field):
+    by_camera, change = np.array([3.0, -2.0, 1.0, 0.5]), 1e-5 * np.eye(4)[field]
+    problem, pair = of_pair(2.5, 2.5, 0.1, by_camera)
+    prior = problem.prior.with_corrected_camera(change)
+    # The first pose stays.
+    step = np.linalg.solve(prior.of_poses[6:, 6:], -prior.g[10:])
+    motion, shift = (motions[1, 0] for motions in problem.poses.moved(
+        np.concatenate([np.zeros(6), step])).relative_motions)
+    moved = np.concatenate([rotation_log(motion @ pair.R.T),
+                            sphere_tangents(pair.t).T @ (unit(shift) - pair.t)])
+    assert moved == pytest.approx(motion_shift(pair, K) @ change, rel=1e-2, abs=1e-9)
+    assert np.log(np.linalg.norm(shift) / 2.5) == pytest.approx(by_camera @ change, rel=1e-2)

@@ -428,6 +428,7 @@ def test_landmarks_are_eliminated_as_numpy_does() -> None:
     rng = np.random.default_rng(5)
     poses, landmarks = scene(rng, frames=6, landmarks=57)
     landmarks.minima += rng.normal(0, 0.3, landmarks.minima.shape)
+    landmarks.points += rng.normal(0, 0.3, landmarks.points.shape)
     # One without observations, and one whose anchor has no precision.
     landmarks.observed[11] = False
     landmarks.anchor_roots[12] = 0

@@ -123,6 +123,13 @@ def test_the_translation_is_measured_in_camera_heights(floor, metres, pitch, tur
     assert (sigmas < [0.05 * metres / HEIGHT, np.radians(1), np.radians(1)]).all()
 
 
+def test_the_ground_is_looked_for_once_in_images_of_a_size_and_anew_in_others(floor):
+    scale, gray = CameraHeightScale(HEIGHT, 0.0), floor.gray()
+    found = [scale._ground_of(view(image)) for image in (gray, gray.copy(), gray[:150], gray)]
+    assert found[0] is found[1]
+    assert found[2] is not found[1] and found[3] is not found[2]
+
+
 def test_the_pitch_may_be_slightly_wrong(floor):
     pitch = np.radians(1.5)
     motion = moved(floor_pose(pitch), floor_pose(pitch, z=0.8))

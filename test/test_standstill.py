@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Array, RelativePose, Status
+from djet_ros.lab.scenes.camera import SensorNoise
+from djet_ros.lab.scenes.cuboid import cuboid
+from djet_ros.lab.scenes.panel import tiled, World
+from djet_ros.lab.scenes.route import pose_at
+from djet_ros.lab.scenes.scene import Scene
+from djet_ros.lab.scenes.texture import fractal, make_texture
+from djet_ros.odometry.frame import Frame
 from djet_ros.odometry.standstill import Standstill
+from djet_ros.odometry.visual_odometry import VisualOdometry
 import numpy as np
 from numpy.typing import NDArray
 import pytest
@@ -25,11 +33,11 @@ def seen(x: Array, y: Array, follow: NDArray[np.bool_] | None = None) -> Relativ
 
 
 def detected(standstill: Standstill, pair: RelativePose, at_rest: bool | None) -> bool:
-    return standstill.detect(pair, MOST, at_rest, HORIZON)
+    return standstill.detect(pair, K, MOST, at_rest)
 
 
 def likely_stands(standstill: Standstill, pair: RelativePose, at_rest: bool | None) -> bool:
-    return standstill.is_likely(pair, MOST, at_rest, HORIZON)
+    return standstill.is_likely(pair, K, MOST, at_rest)
 
 
 def depart(standstill: Standstill, pair: RelativePose | None = None) -> None:
@@ -323,6 +331,84 @@ def test_a_standstill_is_the_previous_motion_of_the_next_pair_unless_much_moves(
     standstill.stay(seen(WORLD, WORLD), MOST)
     standstill.refer()
     assert standstill.prior is None
+
+
+def moves_around(turn_sigma: float = 1e-5, wall: float = 0.7) -> RelativePose:
+    """
+    Return a pair of a camera that passes things and turns, so that a wall behind stays in place.
+
+    turn_sigma: standard deviation of its rotation in rad; wall: share of the features.
+    """
+    depths = np.where(np.random.default_rng(17).uniform(size=400) < wall, 20.0, 2.0)
+    R, t = rotation_exp(np.array([0, -1e-3, 0])), np.array([0.02, 0, 0])
+    rays = np.column_stack([WORLD, np.ones(400)]) @ np.linalg.inv(K).T
+    y = (depths[:, None] * rays) @ R.T + t
+    y = (y @ K.T)[:, :2] / y[:, 2:]
+    return replace(seen(WORLD, y, np.ones(400, bool)), R=R, t=np.array([1.0, 0, 0]),
+                   covariance_5=np.diag(np.repeat([turn_sigma, 1e-2], [3, 2])**2))
+
+
+@pytest.mark.parametrize('wall', [0.7, 0.9])
+def test_a_camera_moves_around_something_though_a_wall_stays_in_place(wall: float) -> None:
+    """What is still is part of the motion of a camera that has turned, and so it is near."""
+    pair = moves_around(wall=wall)
+    assert (np.linalg.norm(pair.y - pair.x, axis=1) < MOST).mean() > 0.5
+    for before in (Standstill(), after_a_stand()):
+        for at_rest in (False, None):
+            assert not detected(before, pair, at_rest)
+        assert detected(before, pair, at_rest=True)
+
+
+def test_a_camera_stands_in_front_of_a_body_that_turns_or_if_its_own_turn_is_none() -> None:
+    """The still features are no part of the body's motion; a turn may be noise, or too small."""
+    pair = moves_around()
+    still = np.linalg.norm(pair.y - pair.x, axis=1) < MOST
+    by_body = replace(pair, inliers=~still)
+    unsure = moves_around(turn_sigma=1e-3)
+    slight = replace(pair, R=rotation_exp(np.array([0, -0.9 * MOST / K[0, 0], 0])))
+    rotates = replace(pair, status=Status.NO_PARALLAX, t=np.zeros(3))
+    for stands in (by_body, unsure, slight, rotates):
+        assert detected(Standstill(), stands, at_rest=None)
+
+
+def test_a_wall_that_stayed_in_place_while_the_camera_moved_around_is_not_attached_to_it() -> None:
+    hides_above = seen(WORLD, np.where(WORLD[:, 1:] > HORIZON, WORLD, scattered(WORLD)))
+    for pair, attached in ((moves_around(wall=1.0), False),
+                           (some_move((1.0, 0.0)), True)):
+        standstill = Standstill()
+        depart(standstill, pair)
+        standstill.stay(seen(WORLD, WORLD), MOST)
+        assert detected(standstill, hides_above, at_rest=None) is not attached
+
+
+@dataclass(frozen=True)
+class Around:
+    """A path to the side by so many metres per frame, always towards a point ten metres ahead."""
+
+    step: float
+    limit: int = 100
+
+    def pose(self, index: int) -> Array:
+        return pose_at((self.step * index, 0, 0), -np.arctan(self.step * index / 10), 0, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('step', [0.01, 0.015])
+def test_a_track_around_a_box_in_front_of_a_wall_goes_on_evenly(step: float) -> None:
+    """The wall, two thirds of the image, moves by less than the threshold from frame to frame."""
+    rng = np.random.default_rng(18)
+    wall, face = (make_texture(np.clip(120 + 45 * fractal(rng, (1024, 1024), 1.0), 5, 250),
+                               (metres, metres)) for metres in (6.0, 1.0))
+    box = cuboid((-0.5, -0.5, 1.5), (0.3, 0.5, 2.2), face)
+    scene = Scene('around', World((tiled((-30, -12, 10), (60, 0, 0), (0, 24, 0), wall), *box)),
+                  Around(step), np.array([[500, 0, 319.5], [0, 500, 239.5], [0, 0, 1.0]]),
+                  (640, 480), 0, effects=(SensorNoise(0.8, 0.06),))
+    odometry, truth = VisualOdometry(), scene.trajectory(10)
+    results = [odometry.process(Frame(scene.render(pose, i), scene.K, i * 33_000_000))
+               for i, pose in enumerate(truth)]
+    assert not any(result.stationary for result in results[3:])
+    steps = np.diff([result.pose[0, 3] for result in results[3:]])
+    assert steps == pytest.approx(np.full(6, steps.mean()), rel=0.05)
 
 
 def test_a_camera_that_vibrates_stood_and_one_that_turns_did_not() -> None:

@@ -730,6 +730,24 @@ def test_speed_times_time_is_the_length():
     assert length.known
 
 
+def test_a_known_length_is_off_by_a_share_of_it_and_by_a_millimetre_at_least():
+    truth = GroundTruthScale(np.array([0, 1, 2]) * 10**8,
+                             np.array([[0, 0, 0], [2, 0, 0], [2, 0, 0.0]]), 0.1)
+    guess, speed = GuessScale(0.1), SpeedScale(0.1)
+    guess.guess.mount(np.eye(4))
+    for tenth, metres in enumerate((0.0, 2.0, 2.0)):
+        guess.guess.add(tenth * 10**8, pose(x=metres))
+    for stamp_ns, fast in ((0, True), (10**8, True), (10**8 + 1, False), (2 * 10**8, False)):
+        speed.add_speed(stamp_ns, 20.0 * fast)
+    for scale in truth, guess, speed:
+        moved, stood = (scale.between(begin * 10**8, (begin + 1) * 10**8) for begin in (0, 1))
+        assert (moved.value, moved.sigma) == (pytest.approx(2.0), pytest.approx(0.2))
+        assert (stood.value, stood.sigma) == (pytest.approx(0.0, abs=1e-6), 1e-3)
+        assert stood.is_zero and not moved.is_zero
+    constant = ConstantScale(2.0, 0.1).between(0, 10**8)
+    assert (constant.value, constant.sigma) == (2.0, pytest.approx(0.2))
+
+
 def test_a_speed_is_held_for_half_a_second_and_then_only_guessed():
     scale = SpeedScale()
     scale.add_speed(0, -2.0)

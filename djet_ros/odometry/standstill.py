@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from djet_ros.core.geometry import norms
+from djet_ros.core.geometry import norms, rotation_log
 from djet_ros.core.rivals import MAX_SLIGHTLY
 from djet_ros.core.types import Array, RelativePose, Status, TRACKED
 from djet_ros.odometry.displacement import cell_of, cells, Displaced, drifted, identifiers, turns
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 # chosen: least share of the matches, and of the cells with matches, that are still if the camera
 # stands in front of traffic; with a gyro at rest also the share if it stood before or if that is
@@ -33,6 +34,9 @@ _SLIGHTLY_OF_ALL = 0.15
 
 # chosen: share of still matches from which what stood is searched near its place.
 _STATIC = 0.9
+
+# Squared standard deviations from no rotation, of which one of a thousand pairs without has more.
+_TURNED = float(chdtri(3, 1e-3))
 
 # chosen: number of pairs in a row in which lorries may hide most of what stood still. After more,
 # the camera may have left unnoticed, with a bonnet that stays in place.
@@ -79,16 +83,19 @@ class Standstill:
         self._most = max(self._most, int(still.sum()))
         self._hidden = 0 if 2 * still.sum() >= self._most else self._hidden + 1
 
-    def detect(self, relative: RelativePose, threshold: float, at_rest: bool | None,
-               horizon: float) -> bool:
+    def detect(self, relative: RelativePose, K: Array, threshold: float,
+               at_rest: bool | None) -> bool:
         """
-        Return whether the camera stands still in a pair.
+        Return whether the camera, with the matrix K (3, 3), stands still in a pair.
 
         at_rest: whether a gyro measured no rotation; None without a gyro. Then what stays in place
         may be a bonnet that moves with the camera, so it has to have stood before, or be above the
-        horizon, a row of pixels.
+        horizon.
         """
         if not len(relative.x) or (not at_rest and self._hidden > _LONGEST_HIDDEN):
+            return False
+        held = _held_in_place(relative, K, threshold)
+        if not at_rest and held.sum() > _is_still(relative, threshold).sum() / 2:
             return False
         apart = self._is_apart(relative.x)
         if _nothing_moves(relative, apart, threshold):
@@ -96,7 +103,7 @@ class Standstill:
         matches = Displaced.of(relative, threshold).among(apart)
         if at_rest is False or (at_rest is None and self._static_features_move(matches, None)):
             return False
-        return (self._only_others_move(_world(matches, at_rest, horizon), bool(at_rest))
+        return (self._only_others_move(_world(matches, K, at_rest), bool(at_rest))
                 or self._static_features_are_still(matches, at_rest))
 
     def _is_apart(self, x: Array) -> NDArray[np.bool_]:
@@ -115,7 +122,8 @@ class Standstill:
                 self._stood = False
             return
         self._stood = False
-        below = Displaced.of(relative, threshold).among(relative.x[:, 1] > K[1, 2])
+        below = Displaced.of(relative, threshold).among(
+            (relative.x[:, 1] > K[1, 2]) & ~_held_in_place(relative, K, threshold))
         self._attached = np.setdiff1d(np.union1d(self._attached, cells(below.x[below.still])),
                                       cells(below.x[~below.still]))
 
@@ -166,20 +174,20 @@ class Standstill:
         vibrates = not at_rest and matches.near.sum() < len(matches.x) / 2
         return static.without_drift() if vibrates else static
 
-    def is_likely(self, relative: RelativePose, threshold: float, at_rest: bool | None,
-                  horizon: float) -> bool:
+    def is_likely(self, relative: RelativePose, K: Array, threshold: float,
+                  at_rest: bool | None) -> bool:
         """
         Return whether a camera that does not rotate more likely stands than has started to move.
 
         It does if it stood before, unless static features move in most of the image; if that is
-        unknown, enough matches have to be still, and few others may move slightly. at_rest,
-        horizon: as for ``detect``.
+        unknown, enough matches have to be still, and few others may move slightly. K, at_rest: as
+        for ``detect``.
         """
         if self._stood is False:
             return False
         matches = Displaced.of(relative, threshold).among(self._is_apart(relative.x))
         if self._stood is None:
-            world = _world(matches, at_rest, horizon)
+            world = _world(matches, K, at_rest)
             return bool(world.still.sum() >= _LEAST_STILL) and not _start_slowly(world)
         return not self._static_features_move(matches, at_rest)
 
@@ -243,9 +251,10 @@ def _in_place(relative: RelativePose, still: NDArray[np.bool_]) -> RelativePose:
                    residuals=norms(relative.y - relative.x))
 
 
-def _world(matches: Displaced, at_rest: bool | None, horizon: float) -> Displaced:
+def _world(matches: Displaced, K: Array, at_rest: bool | None) -> Displaced:
     """Return the matches that are not on a bonnet if they are still: all, if a gyro is at rest."""
-    return matches if at_rest else matches.among(matches.x[:, 1] < horizon)
+    # The principal point is as high as a level camera.
+    return matches if at_rest else matches.among(matches.x[:, 1] < K[1, 2])
 
 
 def _nothing_moves(relative: RelativePose, apart: NDArray[np.bool_], threshold: float) -> bool:
@@ -253,10 +262,28 @@ def _nothing_moves(relative: RelativePose, apart: NDArray[np.bool_], threshold: 
     # Most methods report two equal images as DEGENERATE, as all residuals are zero.
     if relative.status not in (*TRACKED, Status.DEGENERATE) or not apart.any():
         return False
-    x, y = relative.x[apart], _refined(relative)[apart]
-    still = norms(y - x) < threshold
+    x, still = relative.x[apart], _is_still(relative, threshold)[apart]
     # In most of the image too, as a bonnet may have most of the features.
     return bool(still.mean() > 0.5 and len(cells(x[still])) > len(cells(x)) / 2)
+
+
+def _held_in_place(relative: RelativePose, K: Array, threshold: float) -> NDArray[np.bool_]:
+    """
+    Return a mask (N,) of the matches that are still because the camera moves around them.
+
+    It turns by more than the threshold, and its translation takes that back at their depth, such
+    as that of a wall behind what it passes.
+    """
+    turn = rotation_log(relative.R)
+    if (relative.status is not Status.OK or K[0, 0] * np.linalg.norm(turn) < threshold
+            or turn @ np.linalg.solve(relative.covariance_5[:3, :3], turn) < _TURNED):
+        return np.zeros(len(relative.x), bool)
+    return relative.inliers & _is_still(relative, threshold)
+
+
+def _is_still(relative: RelativePose, threshold: float) -> NDArray[np.bool_]:
+    """Return a mask (N,) of the matches that are still, refined if all of them are."""
+    return np.asarray(norms(_refined(relative) - relative.x) < threshold)
 
 
 def _refined(relative: RelativePose) -> Array:

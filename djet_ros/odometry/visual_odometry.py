@@ -233,12 +233,8 @@ class VisualOdometry:
         return pair
 
     def _stands(self, pair: RelativePose, at_rest: bool | None) -> bool:
-        return self._standstill.detect(pair, self._config.standstill, at_rest, self._horizon)
-
-    @property
-    def _horizon(self) -> float:
-        """Return the row of pixels of what is as high as a level camera."""
-        return float(self._reference.view.K[1, 2])
+        return self._standstill.detect(pair, self._reference.view.K, self._config.standstill,
+                                       at_rest)
 
     def _decided(self, view: View, pair: RelativePose, priors: KnownMotion) -> RelativePose:
         """Return the pair with the motion that is consistent with the pair before it, if any."""
@@ -276,8 +272,8 @@ class VisualOdometry:
         standing: the pair as of a camera that stands, with all matches that stay in place.
         """
         return (span[1] - self._priors.known_ns < PASSING_NS
-                and self._standstill.is_likely(standing, self._config.standstill, at_rest,
-                                               self._horizon))
+                and self._standstill.is_likely(standing, self._reference.view.K,
+                                               self._config.standstill, at_rest))
 
     def _has_turned(self, pair: RelativePose, at_rest: bool | None) -> bool:
         """
