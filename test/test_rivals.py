@@ -21,6 +21,8 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import (
     direction_angle,
+    epipolar_lines,
+    fundamental,
     in_front,
     rays,
     rotation_angle,
@@ -365,6 +367,20 @@ def test_planar_twins_are_mutual() -> None:
     assert unsigned_distance(one, back.pose) < 0.01
     y[:30] += 2.0
     assert planar_twin(one, K, x, y, NOISE) is None
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_false_matches_on_their_epipolar_lines_do_not_hide_the_twin_of_a_plane(seed: int) -> None:
+    """They agree with the motion, and have any depth."""
+    rng, (x, y) = np.random.default_rng(seed), plane_of_two_motions()
+    one = Pose(Rotation.from_rotvec((0.01, 0.03, -0.005)).as_matrix(), unit([0.2, 0.1, -0.3]))
+    alone = planar_twin(one, K, x, y, NOISE)
+    false = rng.permutation(len(x))[:6]
+    lines = epipolar_lines(fundamental(K, one.R, one.t), x[false])
+    y[false] += unit(lines[:, 1::-1] * (1, -1)) * rng.uniform(10, 40, (6, 1))
+    beside = planar_twin(one, K, x, y, NOISE)
+    assert alone is not None and beside is not None
+    assert unsigned_distance(alone.pose, beside.pose) < 0.02
 
 
 @pytest.mark.parametrize('seed', range(20))
