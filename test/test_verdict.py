@@ -201,6 +201,25 @@ def test_nor_if_the_wall_is_seen_askew(slope: float) -> None:
         assert off @ np.linalg.solve(turn.covariance_5[:3, :3], off) < CHI2_999_OF_ROTATION
 
 
+def test_the_noise_of_matches_is_no_parallax_that_tells_the_direction_along_a_wall() -> None:
+    """It turns epipolar lines as parallax does; of nine pixels of that, little depends on t."""
+    rng, squares = np.random.default_rng(0), []
+    for _ in range(80):
+        x = rng.uniform((0, 0), SIZE, (300, 2))
+        wall = np.column_stack([x, np.ones(300)]) @ np.linalg.inv(K).T
+        wall *= 8 / np.maximum(wall @ (*rng.normal(0, 0.3, 2), 1), 0.2)[:, None]
+        R = Rotation.from_rotvec(rng.normal(0, 0.02, 3)).as_matrix()
+        t = unit(rng.normal(size=3) * (1, 0.1, 0.05))
+        y, _ = project(K, wall @ R.T + 0.1 * t)
+        pair = estimate(pair_of(x, y + rng.normal(0, 0.3, y.shape)))
+        if pair.status is Status.OK:
+            off = pose_difference(pair.R, pair.t, Pose(R, t))[3:]
+            squares.append(off @ np.linalg.solve(pair.covariance_5[3:, 3:], off))
+    assert len(squares) > 60
+    assert 0.5 < np.median(squares) / chi2.median(2) < 1.3
+    assert np.mean(np.array(squares) > chi2.ppf(0.999, 2)) < 0.06
+
+
 @pytest.mark.parametrize('nearly', [1.0, 0.3])
 def test_what_a_pair_claims_does_not_depend_on_the_order_of_its_rivals(nearly: float) -> None:
     """An improbable rival widens the covariance, but does not hide an undecided one beside it."""
