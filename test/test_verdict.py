@@ -33,6 +33,7 @@ from two_view import (
     project,
     SIDEWAYS,
     SIZE,
+    textured,
     two_views,
     TwoViews,
     uniform_view,
@@ -152,6 +153,28 @@ def test_matches_that_were_left_out_are_outliers_in_their_places() -> None:
     lines = epipolar_lines(fundamental(K, seen.R, seen.t), seen.x)
     np.testing.assert_allclose(whole.residuals, line_distances(lines, y), atol=0.5)
     assert np.median(np.abs(whole.residuals[~kept])) > 3
+
+
+def test_matches_between_places_that_look_unrelated_are_no_motion() -> None:
+    """However well they agree with one."""
+    rng, estimator, (seen, y) = np.random.default_rng(0), TwoViewEstimator(), noisy_views(9)
+    views = [estimator.view(textured(rng, SIZE), K) for _ in range(2)]
+    assert estimate(pair_of(seen.x, y)).status is Status.OK
+    pair = estimate(Pair(*views, seen.x, y))
+    assert pair.inliers.sum() > 150 and np.nanmedian(pair.hamming[pair.inliers]) > 112
+    assert pair.status is Status.DEGENERATE and not pair.t.any()
+
+
+@pytest.mark.parametrize(('side', 'status'), [(30, Status.DEGENERATE), (600, Status.OK)])
+def test_matches_of_one_cell_of_the_image_determine_no_motion(side: float, status: Status) -> None:
+    """They may be of one object, and share their errors."""
+    rng = np.random.default_rng(10)
+    x = (609, 161) + rng.uniform(0, (side, side / 3), (300, 2))
+    points = np.column_stack([x, np.ones(300)]) @ np.linalg.inv(K).T * rng.uniform(4, 40, (300, 1))
+    y, _ = project(K, points + SIDEWAYS)
+    pair = estimate(pair_of(x, y + rng.normal(0, 0.05, y.shape)))
+    assert pair.status is status
+    assert pair.t.any() == np.isfinite(pair.covariance_6).all() == (status is Status.OK)
 
 
 def test_a_rotation_of_noise_is_not_biased() -> None:
