@@ -126,6 +126,25 @@ def test_a_wrong_camera_matrix_is_in_the_covariance_without_rivals_too() -> None
                                wrong.covariance_5 - exact.covariance_5, atol=1e-9)
 
 
+@pytest.mark.parametrize('sign', [1, -1])
+def test_a_wrong_camera_matrix_moves_rotation_and_direction_together_as_claimed(sign: int) -> None:
+    """Whichever sign of t the search started with."""
+    seen, _ = noisy_views(11, count=400)
+    start, errors = Pose(seen.R, sign * seen.t), []
+    # The three parameters, as all of them add up in the covariance.
+    for off in ([1, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]):
+        lens = K + [[off[0], 0, off[2]], [0, off[1], off[3]], [0, 0, 0]]
+        view = uniform_view(lens)
+        pair = estimate(Pair(view, view, seen.x, seen.y, start=start))
+        errors.append(pose_difference(pair.R, pair.t, Pose(seen.R, seen.t)))
+    expected = np.transpose(errors) @ errors
+    exact, unsure = (estimate(pair_of(seen.x, seen.y, start), calibration_sigma=sigma)
+                     for sigma in (0.0, 1.0))
+    size = np.sqrt(np.diag(expected))
+    np.testing.assert_array_less(
+        np.abs(unsure.covariance_5 - exact.covariance_5 - expected), 0.1 * np.outer(size, size))
+
+
 def test_without_parallax_residuals_are_distances_from_lines_and_no_opposite_is_a_rival() -> None:
     seen, y = noisy_views(5, near=1e5, far=1e6)
     turn = estimate(pair_of(seen.x, y))
@@ -169,7 +188,7 @@ def test_matches_between_places_that_look_unrelated_are_no_motion() -> None:
 def test_matches_of_one_cell_of_the_image_determine_no_motion(side: float, status: Status) -> None:
     """They may be of one object, and share their errors."""
     rng = np.random.default_rng(10)
-    x = (609, 161) + rng.uniform(0, (side, side / 3), (300, 2))
+    x = rng.uniform((609, 161), (609 + side, 161 + side / 3), (300, 2))
     points = np.column_stack([x, np.ones(300)]) @ np.linalg.inv(K).T * rng.uniform(4, 40, (300, 1))
     y, _ = project(K, points + SIDEWAYS)
     pair = estimate(pair_of(x, y + rng.normal(0, 0.05, y.shape)))
