@@ -113,9 +113,10 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     eigenvalues = np.linalg.eigvalsh(H)
     if eigenvalues[0] <= 1e-12 * eigenvalues[-1]:
         return UNDETERMINED
-    if hessian is None:
-        hessian = (J * loss.curvature(squared)) @ J.T
-    curved = _loss_curvature(H, hessian)
+    curved = _loss_curvature(H, (J * loss.curvature(squared)) @ J.T)
+    # Second derivatives of outliers do not make a minimum of what is none by the inliers.
+    if curved is not None and hessian is not None:
+        curved = _loss_curvature(H, hessian)
     cells, pulls, products = _summed_by_cell(H, places, J, weights, residuals.r)
     large = cells.in_larger(max(np.sqrt(np.ptp(places, axis=0).prod() / LARGE_CELLS), CELL))
     if curved is None or not (cells.determine_pose() and large.determine_pose()):
