@@ -91,6 +91,17 @@ def test_scattered_outliers_are_no_body() -> None:
     assert of_followed_body(pair, pair.y).all()
 
 
+@pytest.mark.parametrize(('count', 'left_out'), [(90, False), (130, True)])
+def test_a_body_with_less_than_an_eighth_of_the_matches_is_not_left_out(
+        count: int, left_out: bool) -> None:
+    rng = np.random.default_rng(0)
+    pair = pair_with_a_lorry(rng)
+    pair.residuals[:] = rng.normal(0, NOISE, 800)
+    of_body = np.argsort(np.linalg.norm(pair.y - pair.y[700], axis=1))[:count]
+    pair.residuals[of_body] = 3.0
+    assert of_followed_body(pair, pair.y[of_body[:20]]).all() != left_out
+
+
 def test_a_pair_without_inliers_follows_no_body_more_than_another() -> None:
     pair = pair_with_a_lorry(np.random.default_rng(0))
     pair.inliers[:] = False

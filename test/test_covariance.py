@@ -5,7 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from cards import Cards, K as CARDS_K, pose as card_pose
-from djet_ros.core.covariance import calibration_covariance, pose_covariance, widened_by_profile
+from djet_ros.core.covariance import (
+    calibration_covariance,
+    loss_hessian,
+    pose_covariance,
+    widened_by_profile,
+)
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig, preset
 from djet_ros.core.geometry import rotation_log, sphere_log, sphere_tangents, unit
@@ -270,6 +275,28 @@ def test_profile_widens_where_matches_become_outliers(share, least, most):
     # A sum of squares rises as its curvature predicts, for small differences of the pose.
     squares = widened_by_profile(claimed, problem, pose, Loss())
     assert np.allclose(np.linalg.eigvals(np.linalg.solve(claimed, squares)).real, 1, atol=0.2)
+
+
+@pytest.mark.parametrize('t', [SIDEWAYS, FORWARD, (0.6, 0.8, 0.0)])
+def test_the_hessian_of_a_loss_is_that_of_its_second_differences(t):
+    rng = np.random.default_rng(6)
+    views = two_views(rng, 300, t=t, near=100, far=120)
+    y = views.y + rng.normal(0, 0.5, views.y.shape)
+    problem = jet_problem(views.K, views.x, ReprojectionSurface(views.x, y).fit_around(y), 5.0)
+    loss = Loss('geman_mcclure', 1.0)
+    end = minimise(problem, views.R, views.t, loss)
+
+    def cost(step):
+        at = epipolar_residuals(problem, *retract(end.R, end.t, end.residuals.tangents, step))
+        return loss(at.r**2)[0].sum() / 2
+
+    steps = 2e-5 * np.eye(5)
+    differences = [[cost(one + other) - cost(one - other) - cost(other - one) + cost(-one - other)
+                    for other in steps] for one in steps]
+    expected = np.array(differences) / (2 * steps[0, 0])**2
+    found = loss_hessian(problem, end.pose, end.residuals, loss)
+    size = np.sqrt(np.diag(expected))
+    np.testing.assert_array_less(np.abs(found - expected), 0.01 * np.outer(size, size))
 
 
 @pytest.mark.parametrize('direction', [2, -2])

@@ -21,6 +21,8 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import (
     direction_angle,
+    epipolar_lines,
+    fundamental,
     in_front,
     rays,
     rotation_angle,
@@ -33,10 +35,12 @@ from djet_ros.core.rivals import (
     continues_motion,
     false_alarms,
     is_planar,
+    may_stand,
     planar_twin,
     pose_distance,
     preferences,
     PreviousMotion,
+    static_by_depth,
     unsigned_distance,
 )
 from djet_ros.core.sketch import losses_at
@@ -133,6 +137,30 @@ def test_the_static_world_spans_depths_even_if_a_flat_body_has_most_matches(
     assert direction_angle(result.t, seen.t) < 0.02
 
 
+@pytest.mark.parametrize(('flatness', 'static'), [
+    ((0.1, 0.8), 0), ((0.8, 0.1), 1), ((0.1, 0.1), None), ((0.8, 0.8), None), ((0.4, 0.8), None),
+    ((0.1, 0.4), None), ((np.nan, 0.8), None), ((0.1, np.nan), None)])
+def test_the_static_world_alone_has_depths_from_near_to_far(
+        flatness: tuple[float, float], static: int | None) -> None:
+    """Near over far depth of both bodies, NaN if noise hides it."""
+    assert static_by_depth(flatness) == static
+
+
+@pytest.mark.parametrize(('box', 'narrower'), [((0, 700), False), ((300, 500), True)])
+def test_of_two_bodies_that_nothing_tells_apart_the_one_over_a_wider_area_is_the_best_guess(
+        box: tuple[float, float], narrower: bool) -> None:
+    """The static world surrounds what moves in it; the other motion is the rival."""
+    seen, x, y, body = scene_with_body(200, 300, 'across', box, DEEP)
+    if not narrower:
+        keep = np.arange(500)[(np.arange(500) >= 200) | (np.abs(x[:, 0] - 950) < 150)]
+        x, y = x[keep], y[keep]
+    result = estimate(x, y)
+    guess, other = (seen.t, body.t) if narrower else (body.t, seen.t)
+    assert result.status is Status.TWO_MOTIONS
+    assert direction_angle(result.t, guess) < 0.1
+    assert min(direction_angle(rival.pose.t, other) for rival in result.rivals) < 0.1
+
+
 def test_a_body_without_parallax_may_be_the_static_world(
         monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(BODIES, 'beside', (0.0, 0.0, 1e-9))
@@ -227,6 +255,33 @@ def test_a_body_that_passes_may_move_instead_of_the_camera() -> None:
         assert result.status is status
         sigma = np.degrees(np.sqrt(np.trace(result.covariance_5[3:, 3:])))
         assert (sigma > 90) == (status is Status.TWO_MOTIONS)
+
+
+@pytest.mark.parametrize(('far', 'turn', 'still', 'slightly', 'prior', 'stands'), [
+    (9.0, 0.0, 60, 0, None, True),
+    (80.0, 0.0, 60, 0, None, False),  # the static world
+    (9.0, 0.01, 60, 0, None, False),
+    (9.0, 0.0, 20, 0, None, False),
+    (9.0, 0.0, 60, 12, None, True),
+    (9.0, 0.0, 60, 18, None, False),
+    (9.0, 0.0, 60, 0, 0.05, False),
+    (9.0, 0.0, 60, 0, 0.2, True)])
+def test_a_camera_may_stand_if_enough_stays_and_all_else_moves_far_as_one_compact_body(
+        far: float, turn: float, still: int, slightly: int, prior: float | None, stands: bool
+        ) -> None:
+    """It may not if it turns, or goes on as before. Slightly is by 6 to 18 standard deviations."""
+    rng = np.random.default_rng(1)
+    seen = two_views(rng, count=400, t=SIDEWAYS, turn=(0.0, turn, 0.0), near=8, far=far)
+    in_place = rng.uniform((0, 0), SIZE, (still + slightly, 2))
+    false = rng.uniform((0, 0), SIZE, (2, 100, 2))
+    x, y = (np.concatenate(parts) for parts in zip((seen.x, seen.y), false, (in_place, in_place)))
+    y[len(y) - slightly:, 0] += 12 * NOISE
+    y += rng.normal(0, NOISE, y.shape)
+    problem = jet_problem(K, x, ReprojectionSurface(x, y).fit_around(y))
+    pose = Pose(seen.R, seen.t)
+    before = None if prior is None else Pose(rotation_exp(np.array([prior, 0, 0])), seen.t)
+    assert may_stand(problem, np.linalg.norm(y - x, axis=1), pose, K[0, 0], NOISE, 30, before
+                     ) == stands
 
 
 @pytest.mark.parametrize('differs', ['depths', 'turn', 'slightly'])
@@ -365,6 +420,20 @@ def test_planar_twins_are_mutual() -> None:
     assert unsigned_distance(one, back.pose) < 0.01
     y[:30] += 2.0
     assert planar_twin(one, K, x, y, NOISE) is None
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_false_matches_on_their_epipolar_lines_do_not_hide_the_twin_of_a_plane(seed: int) -> None:
+    """They agree with the motion, and have any depth."""
+    rng, (x, y) = np.random.default_rng(seed), plane_of_two_motions()
+    one = Pose(Rotation.from_rotvec((0.01, 0.03, -0.005)).as_matrix(), unit([0.2, 0.1, -0.3]))
+    alone = planar_twin(one, K, x, y, NOISE)
+    false = rng.permutation(len(x))[:6]
+    lines = epipolar_lines(fundamental(K, one.R, one.t), x[false])
+    y[false] += unit(lines[:, 1::-1] * (1, -1)) * rng.uniform(10, 40, (6, 1))
+    beside = planar_twin(one, K, x, y, NOISE)
+    assert alone is not None and beside is not None
+    assert unsigned_distance(alone.pose, beside.pose) < 0.02
 
 
 @pytest.mark.parametrize('seed', range(20))

@@ -1,5 +1,6 @@
 """The pair before decides which of the motions that a pair alone leaves open is the true one."""
 
+from dataclasses import replace
 from itertools import pairwise, product
 
 import cv2
@@ -131,6 +132,35 @@ def test_a_slow_camera_hardly_ever_finds_that_its_matches_chose_the_wrong_motion
         assert found is None or np.array_equal(found.t, later[0].t)
         decided += found is not None
     assert decided > 100
+
+
+def test_what_matches_prefer_is_confirmed_by_less_than_overrules_them():
+    """Of a slow camera, whose depths are noisy."""
+    confirmed, overruled = [], []
+    for seed in range(40):
+        (before, *earlier), (current, *later) = three_views_of_a_plane(seed, speed=0.03)
+        if not all(motion.t.any() for motion in (*earlier, *later)):
+            continue  # the plane has one motion only
+        before = of_motions(before, *earlier)
+        for motions, found in ((later, confirmed), (later[::-1], overruled)):
+            pair = of_motions(current, *motions)
+            found.append([consistent_motion(before, replace(pair, status=status), K) is not None
+                          for status in (Status.AMBIGUOUS, Status.OK)])
+    assert np.sum(confirmed, axis=0)[0] + 2 <= np.sum(confirmed, axis=0)[1]
+    assert all(undecided == sure for undecided, sure in overruled)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_fewer_than_thirty_shared_points_do_not_even_confirm_what_matches_prefer(seed):
+    (before, *earlier), (current, *later) = three_views_of_a_plane(seed)
+    # Even what the matches prefer.
+    before = of_motions(before, *earlier)
+    current = replace(of_motions(current, *later), status=Status.OK)
+    shared = np.flatnonzero(np.isin(current.x[:, 0], before.y[:, 0]))
+    for count, decides in ((25, False), (100, True)):
+        current.inliers[:] = False
+        current.inliers[shared[:count]] = True
+        assert (consistent_motion(before, current, K) is not None) == decides
 
 
 def test_a_wrong_motion_before_decides_nothing():

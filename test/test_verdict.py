@@ -33,6 +33,7 @@ from two_view import (
     project,
     SIDEWAYS,
     SIZE,
+    textured,
     two_views,
     TwoViews,
     uniform_view,
@@ -125,6 +126,24 @@ def test_a_wrong_camera_matrix_is_in_the_covariance_without_rivals_too() -> None
                                wrong.covariance_5 - exact.covariance_5, atol=1e-9)
 
 
+@pytest.mark.parametrize('sign', [1, -1])
+def test_a_wrong_camera_matrix_moves_rotation_and_direction_together_as_claimed(sign: int) -> None:
+    """Whichever sign of t the search started with."""
+    seen, _ = noisy_views(11, count=400)
+    start, errors = Pose(seen.R, sign * seen.t), []
+    # The three parameters, as all of them add up in the covariance.
+    for f, cx, cy in np.eye(3):
+        view = uniform_view(np.add(K, [[f, 0, cx], [0, f, cy], [0, 0, 0]]))
+        pair = estimate(Pair(view, view, seen.x, seen.y, start=start))
+        errors.append(pose_difference(pair.R, pair.t, Pose(seen.R, seen.t)))
+    expected = np.transpose(errors) @ errors
+    exact, unsure = (estimate(pair_of(seen.x, seen.y, start), calibration_sigma=sigma)
+                     for sigma in (0.0, 1.0))
+    size = np.sqrt(np.diag(expected))
+    np.testing.assert_array_less(
+        np.abs(unsure.covariance_5 - exact.covariance_5 - expected), 0.1 * np.outer(size, size))
+
+
 def test_without_parallax_residuals_are_distances_from_lines_and_no_opposite_is_a_rival() -> None:
     seen, y = noisy_views(5, near=1e5, far=1e6)
     turn = estimate(pair_of(seen.x, y))
@@ -152,6 +171,28 @@ def test_matches_that_were_left_out_are_outliers_in_their_places() -> None:
     lines = epipolar_lines(fundamental(K, seen.R, seen.t), seen.x)
     np.testing.assert_allclose(whole.residuals, line_distances(lines, y), atol=0.5)
     assert np.median(np.abs(whole.residuals[~kept])) > 3
+
+
+def test_matches_between_places_that_look_unrelated_are_no_motion() -> None:
+    """However well they agree with one."""
+    rng, estimator, (seen, y) = np.random.default_rng(0), TwoViewEstimator(), noisy_views(9)
+    views = [estimator.view(textured(rng, SIZE), K) for _ in range(2)]
+    assert estimate(pair_of(seen.x, y)).status is Status.OK
+    pair = estimate(Pair(*views, seen.x, y))
+    assert pair.inliers.sum() > 150 and np.nanmedian(pair.hamming[pair.inliers]) > 112
+    assert pair.status is Status.DEGENERATE and not pair.t.any()
+
+
+@pytest.mark.parametrize(('side', 'status'), [(30, Status.DEGENERATE), (600, Status.OK)])
+def test_matches_of_one_cell_of_the_image_determine_no_motion(side: float, status: Status) -> None:
+    """They may be of one object, and share their errors."""
+    rng = np.random.default_rng(10)
+    x = rng.uniform((609, 161), (609 + side, 161 + side / 3), (300, 2))
+    points = np.column_stack([x, np.ones(300)]) @ np.linalg.inv(K).T * rng.uniform(4, 40, (300, 1))
+    y, _ = project(K, points + SIDEWAYS)
+    pair = estimate(pair_of(x, y + rng.normal(0, 0.05, y.shape)))
+    assert pair.status is status
+    assert pair.t.any() == np.isfinite(pair.covariance_6).all() == (status is Status.OK)
 
 
 def test_a_rotation_of_noise_is_not_biased() -> None:
@@ -199,6 +240,25 @@ def test_nor_if_the_wall_is_seen_askew(slope: float) -> None:
         assert turn.status is Status.NO_PARALLAX
         off = rotation_log(turn.R @ R.T)
         assert off @ np.linalg.solve(turn.covariance_5[:3, :3], off) < CHI2_999_OF_ROTATION
+
+
+def test_the_noise_of_matches_is_no_parallax_that_tells_the_direction_along_a_wall() -> None:
+    """It turns epipolar lines as parallax does; of nine pixels of that, little depends on t."""
+    rng, squares = np.random.default_rng(0), []
+    for _ in range(80):
+        x = rng.uniform((0, 0), SIZE, (300, 2))
+        wall = np.column_stack([x, np.ones(300)]) @ np.linalg.inv(K).T
+        wall *= 8 / np.maximum(wall @ (*rng.normal(0, 0.3, 2), 1), 0.2)[:, None]
+        R = Rotation.from_rotvec(rng.normal(0, 0.02, 3)).as_matrix()
+        t = unit(rng.normal(size=3) * (1, 0.1, 0.05))
+        y, _ = project(K, wall @ R.T + 0.1 * t)
+        pair = estimate(pair_of(x, y + rng.normal(0, 0.3, y.shape)))
+        if pair.status is Status.OK:
+            off = pose_difference(pair.R, pair.t, Pose(R, t))[3:]
+            squares.append(off @ np.linalg.solve(pair.covariance_5[3:, 3:], off))
+    assert len(squares) > 60
+    assert 0.5 < np.median(squares) / chi2.median(2) < 1.3
+    assert np.mean(np.array(squares) > chi2.ppf(0.999, 2)) < 0.06
 
 
 @pytest.mark.parametrize('nearly', [1.0, 0.3])

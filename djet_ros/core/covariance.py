@@ -62,6 +62,9 @@ _MIN_RISE = 0.05
 # rad^2; a nanoradian, far below any noise, against division by zero on perfect data.
 _MIN_VARIANCE = 1e-18
 
+# rad; step of the differences of gradients: half of the digits of a float.
+_DIFFERENCE = 1e-7
+
 # Covariances of a pose that is not determined.
 UNDETERMINED = np.full((5, 5), np.nan), np.full((6, 6), np.nan)
 for _unknown in UNDETERMINED:
@@ -86,12 +89,13 @@ _HEAVY = 0.9
 
 
 def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
-                    flipped: bool) -> tuple[Array, Array]:
+                    flipped: bool, hessian: Array | None = None) -> tuple[Array, Array]:
     """
     Return the covariance of (rotation vector in rad from the left, direction of t) at the minimum.
 
     places: (N, 2) pixels of the matches; t: (3,) the final direction, `flipped` if it is opposite
-    to the optimiser's. Returns the covariance (5, 5) in the basis ``sphere_tangents(t)``, and
+    to the optimiser's; hessian: (5, 5) as of `loss_hessian`, without the curvature of residuals if
+    None. Returns the covariance (5, 5) in the basis ``sphere_tangents(t)``, and
     (6, 6) over (rotation vector, t), of rank 5 because t has unit length. All NaN if the matches
     do not determine the pose, if only those of one cell do, or if they lie in too few cells.
 
@@ -110,6 +114,9 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     if eigenvalues[0] <= 1e-12 * eigenvalues[-1]:
         return UNDETERMINED
     curved = _loss_curvature(H, (J * loss.curvature(squared)) @ J.T)
+    # Second derivatives of outliers do not make a minimum of what is none by the inliers.
+    if curved is not None and hessian is not None:
+        curved = _loss_curvature(H, hessian)
     cells, pulls, products = _summed_by_cell(H, places, J, weights, residuals.r)
     large = cells.in_larger(max(np.sqrt(np.ptp(places, axis=0).prod() / LARGE_CELLS), CELL))
     if curved is None or not (cells.determine_pose() and large.determine_pose()):
@@ -134,8 +141,30 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     return basis.T @ covariance_6 @ basis, covariance_6
 
 
+def loss_hessian(problem: JetProblem, pose: Pose, residuals: Residuals, loss: Loss) -> Array:
+    """
+    Return half of the Hessian (5, 5) of the summed loss at its minimum, with these residuals.
+
+    It includes their second derivatives. To J J^T the noise of a match along its epipolar line is
+    parallax, and so information about t; the second derivatives take that off again. Of a slow
+    camera along a wall, whose own parallax tells little of t, it would be most of the information.
+    """
+    def gradient(at: Residuals) -> Array:
+        return at.jacobian @ (loss(at.r**2)[1] * at.r)
+
+    none, basis, steps = gradient(residuals), residuals.tangents, _DIFFERENCE * np.eye(5)
+    changes = np.empty((5, 5))
+    for row, R, t in zip(changes, *moved_all(pose.R, pose.t, basis, steps)):
+        moved = epipolar_residuals(problem, R, t)
+        # In the tangents that the moved t has, which may be others.
+        there = gradient(moved)
+        row[:3], row[3:] = there[:3], basis.T @ moved.tangents @ there[3:]
+    changes = (changes - none) / _DIFFERENCE
+    return np.asarray(changes + changes.T) / 2
+
+
 def widened_by_profile(covariance: Array, problem: JetProblem, pose: Pose, loss: Loss,
-                       residuals: Residuals | None = None) -> Array:
+                       residuals: Residuals | None = None, hessian: Array | None = None) -> Array:
     """
     Widen a covariance (5, 5) where the loss rises less than its curvature at the minimum predicts.
 
@@ -144,11 +173,13 @@ def widened_by_profile(covariance: Array, problem: JetProblem, pose: Pose, loss:
     So the loss is evaluated where each axis of the ellipsoid meets the 95 % bound, on both sides:
     if it has risen by a share of what a parabola would have on either side, the standard deviation
     is divided by that share. (Profile likelihoods, as in Bates and Watts, Nonlinear Regression
-    Analysis, chapter 6.) residuals: those at the pose, if known.
+    Analysis, chapter 6.) residuals, hessian: those at the pose, if known.
     """
     residuals = residuals or epipolar_residuals(problem, pose.R, pose.t)
-    J, squared = residuals.jacobian, residuals.r**2
-    curved = _loss_curvature((J * loss(squared)[1]) @ J.T, (J * loss.curvature(squared)) @ J.T)
+    if hessian is None:
+        hessian = loss_hessian(problem, pose, residuals, loss)
+    J = residuals.jacobian
+    curved = _loss_curvature((J * loss(residuals.r**2)[1]) @ J.T, hessian)
     variances, axes = np.linalg.eigh(covariance)
     if curved is None or variances[0] <= 0:
         return covariance

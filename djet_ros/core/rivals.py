@@ -21,6 +21,7 @@ from djet_ros.core.geometry import (
     unit,
 )
 from djet_ros.core.jet import clipped_scale, JetProblem, Loss, robust_scale
+from djet_ros.core.medians import median
 from djet_ros.core.sketch import losses_in_front, refine_all, Sketch
 from djet_ros.core.starts import starts_around, subsampled
 from djet_ros.core.types import Array, Pose, RelativePose, Rival
@@ -60,6 +61,9 @@ _MAX_OFF_PLANE = 0.1
 # chosen: factor by which their errors may exceed the noise; on rendered planes at most 1.3, in
 # other scenes that a plane fits loosely 1.5 to 4, except for two of fifteen.
 _MAX_EXCESS = 1.5
+
+# Rounds of reweighting in which a plane is fitted, as many as of `fit_rotation`.
+_PLANE_ROUNDS = 5
 
 # Quantiles of the inverse depths of a body that are its far and near end; chosen: some points are
 # outliers.
@@ -229,9 +233,26 @@ def _induced_homography(pose: Pose, K: Array, x: Array, y: Array, noise: float) 
     inverse, sigma = inverse_depths(pose.R, pose.t, rays_x, rays(K, y))
     if not (np.isfinite(inverse) & np.isfinite(sigma) & (sigma > 0)).all():
         return None
-    n = np.linalg.lstsq(rays_x / sigma[:, None], inverse / sigma, rcond=None)[0]
-    H = np.asarray(pose.R + np.outer(pose.t, n))
+    H = np.asarray(pose.R + np.outer(pose.t, _fitted_plane(rays_x, inverse, sigma)))
     return H if _fits_homography(K @ H @ np.linalg.inv(K), x, y, noise) else None
+
+
+def _fitted_plane(rays_x: Array, inverse: Array, sigma: Array) -> Array:
+    """
+    Return the n (3,) of a plane, n'x = rho, fitted to inverse depths (N,) of rays (N, 3).
+
+    Robust as `fit_rotation`: false matches that slip along their epipolar lines are inliers of the
+    motion, and a few of them would shift the plane by more than its noise. sigma: (N,) errors of
+    the depths.
+    """
+    design, depths, weights = rays_x / sigma[:, None], inverse / sigma, np.ones(len(sigma))
+    for _ in range(_PLANE_ROUNDS):
+        weighted = design.T * weights
+        # Of a few matches, or those on a row, the shortest.
+        n = np.linalg.lstsq(weighted @ design, weighted @ depths, rcond=None)[0]
+        squared = (design @ n - depths)**2
+        weights = 1 / (1 + squared / max(median(squared), 1e-18))
+    return np.asarray(n)
 
 
 def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,

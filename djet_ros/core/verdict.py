@@ -11,6 +11,7 @@ from djet_ros.core.covariance import (
     calibration_covariance,
     is_within,
     lifted_covariance,
+    loss_hessian,
     pose_covariance,
     pose_difference,
     UNDETERMINED,
@@ -248,12 +249,13 @@ def _covariance(track: Track, pose: Pose, x: Array, flipped: bool) -> Array:
     x: (N, 2) pixels of the matches in the previous image; flipped: whether the pose has the
     opposite t to that of the track.
     """
-    voting = x.compress(track.voting, axis=0)
-    covariance, _ = pose_covariance(track.residuals, track.loss, voting, pose.t, flipped)
+    voting, problem, loss = x.compress(track.voting, axis=0), track.problem, track.loss
+    residuals = epipolar_residuals(problem, pose.R, pose.t) if flipped else track.residuals
+    hessian = loss_hessian(problem, pose, residuals, loss)
+    covariance, _ = pose_covariance(residuals, loss, voting, pose.t, False, hessian)
     if not np.isfinite(covariance).all():
         return covariance
-    return widened_by_profile(covariance, track.problem, pose, track.loss,
-                              None if flipped else track.residuals)
+    return widened_by_profile(covariance, problem, pose, loss, residuals, hessian)
 
 
 def _compare_with_rivals(pose: Pose, covariance: Array, track: Track, x: Array,
