@@ -225,10 +225,11 @@ def test_an_invalid_rotation_is_refused(text: str) -> None:
 # Live
 
 class Graph:
-    """Records what a session publishes, and knows one transform."""
+    """Records what a session publishes, and knows one transform; rate: that of its clock."""
 
     def __init__(self) -> None:
         self.published: list[Any] = []
+        self.rate = 1.0
         self.frames = StaticFrames()
 
     def publish(self, outgoing: Any) -> None:
@@ -242,6 +243,9 @@ class Graph:
 
     def wants(self, topic: str) -> bool:
         return False
+
+    def now_ns(self) -> int:
+        return round(monotonic() * 1e9 * self.rate)
 
     def transform(self, base: str, camera: str) -> Array | None:
         return self.frames.transform(base, camera)
@@ -330,6 +334,32 @@ def test_an_image_does_not_wait_for_a_gyro_that_is_silent(live: Any, drive: Driv
         assert monotonic() < end
         sleep(0.005)  # for the worker thread
     assert monotonic() - start < 3
+
+
+@pytest.mark.parametrize('policy', ['latest', 'every'])
+def test_a_bag_that_is_played_slowly_loses_no_masks(live: Any, drive: Drive, policy: str) -> None:
+    session, one, graph = live(**{'odometry.mask': True, 'ros.queue_policy': policy})
+    graph.rate = 0.02
+    all_free = np.full(SIZE[::-1], 255, np.uint8)
+    for i in range(2):
+        session.image(drive.image(i))
+        sleep(0.5)  # 0.01 s of the clock
+        assert one.counts.received == i
+        session.mask(drive.image(i, all_free))
+        wait_for(one, i + 1)
+
+
+@pytest.mark.parametrize('policy', ['latest', 'every'])
+def test_an_image_does_not_wait_for_a_clock_that_stands(
+        live: Any, drive: Drive, policy: str) -> None:
+    session, one, graph = live(**{'odometry.mask': True, 'ros.queue_policy': policy})
+    graph.rate = 0.0
+    start = monotonic()
+    for i in range(5):
+        session.image(drive.image(i))
+        wait_for(one, i + 1)
+    # It is found to stand once.
+    assert monotonic() - start < 4
 
 
 @pytest.mark.slow

@@ -246,13 +246,29 @@ def test_trailing_zeros_after_a_jpeg_are_usual():
     assert gray_image(compressed(encoded('.jpg') + bytes(900))).shape == GRAY.shape
 
 
+def with_segment(data, kind, body):
+    return data[:2] + kind + struct.pack('>H', len(body) + 2) + body + data[2:]
+
+
+def test_a_video_after_a_jpeg_does_not_matter():
+    # A motion photo; bytes of a video look like any marker now and then.
+    video = bytes(5000) + b'\xff\xda' * 100 + bytes(5000)
+    assert np.array_equal(gray_image(compressed(encoded('.jpg') + video)),
+                          gray_image(compressed(encoded('.jpg'))))
+
+
+def test_the_end_of_a_thumbnail_is_not_that_of_the_image():
+    data, thumbnail = encoded('.jpg'), cv2.imencode('.jpg', GRAY[::2, ::2])[1].tobytes()
+    cut = with_segment(data[:-20], b'\xff\xe1', b'Exif\0\0' + thumbnail) + bytes(500)
+    assert reason(compressed(cut)) == 'undecodable'
+
+
 def test_an_orientation_tag_does_not_rotate_the_image():
     data = encoded('.jpg')
     # EXIF with one entry: orientation 6, a rotation by 90 degrees.
     exif = (b'Exif\0\0MM\0*\0\0\0\x08\0\x01' + struct.pack('>HHIHH', 0x112, 3, 1, 6, 0)
             + bytes(4))
-    tagged = data[:2] + b'\xff\xe1' + struct.pack('>H', len(exif) + 2) + exif + data[2:]
-    assert gray_image(compressed(tagged)).shape == GRAY.shape
+    assert gray_image(compressed(with_segment(data, b'\xff\xe1', exif))).shape == GRAY.shape
 
 
 def huge_png():

@@ -457,6 +457,31 @@ def test_messages_have_image_stamps_and_diagnostics_simulated_time(
     assert [stamp_ns(m.header) for m in subscriber.received[RELATIVE]] == [stamp(1), stamp(2)]
 
 
+def test_a_bag_that_is_played_slowly_loses_no_masks(node, publisher, subscriber, drive):
+    node(**EVERY, use_sim_time=True, **{'odometry.mask': True})
+    camera(publisher)
+    publisher.advertise('/clock', 'rosgraph_msgs/msg/Clock')
+    publisher.advertise('/mask', IMAGE_TYPE)
+    clock, odometry = message_type('rosgraph_msgs/msg/Clock'), f'{NODE}/odometry'
+    now = START
+
+    def run_slowly(seconds: float) -> None:
+        nonlocal now
+        end = monotonic() + seconds
+        while monotonic() < end:
+            now += 500_000
+            publisher.send('/clock', clock(clock=header(now).stamp))
+            sleep(0.025)
+
+    run_slowly(0.5)
+    for i, gray in enumerate(drive[:3]):
+        play(publisher, [gray], first=i)
+        run_slowly(0.8)
+        assert len(subscriber.received[odometry]) == i
+        publisher.send('/mask', image(np.full_like(gray, 255), stamp_ns=stamp(i)))
+        subscriber.wait('odometry', lambda received, n=i + 1: len(received[odometry]) == n)
+
+
 # Services
 
 def test_pause_and_resume(node, publisher, subscriber, drive):

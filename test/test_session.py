@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from sys import getrefcount
 from threading import Condition, Event, Thread
-from time import monotonic, sleep
+from time import monotonic, sleep, time_ns
 from typing import Any
 
 from cards import Cards, K, pose, SIZE
@@ -57,6 +57,9 @@ class Graph:
 
     def why_silent(self, topic: str) -> str:
         return f'nothing is seen of {topic}'
+
+    def now_ns(self) -> int:
+        return time_ns()
 
     def transform(self, parent: str, child: str) -> Any:
         return self.frames.get((parent, child))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from threading import Event
-from time import monotonic
 from typing import Any, NamedTuple
 
 from djet_ros.live.frame_queue import FrameQueue
+from djet_ros.live.stopwatch import Moment, Stopwatch
 from djet_ros.odometry.tracker import Tracker
-import numpy as np
 
 # Messages in the queue: minutes of a fast IMU.
 _MAX_MESSAGES = 100_000
@@ -19,37 +19,42 @@ class _Queued(NamedTuple):
 
     what: str
     message: Any
-    at: float
+    at: Moment
 
 
 class AuxiliaryQueue:
     """
     Messages in the order of arrival; put by one thread, passed to the tracker by another.
 
-    newest: arrival time (monotonic seconds) of the last one; max_bytes: limit of the queue, beyond
-    which the oldest are dropped.
+    newest: arrival of the last one; max_bytes: limit of the queue, beyond which the oldest are
+    dropped.
     """
 
-    def __init__(self, max_bytes: float) -> None:
+    def __init__(self, stopwatch: Stopwatch, max_bytes: float) -> None:
+        self._stopwatch = stopwatch
         self._queue: FrameQueue[_Queued] = FrameQueue('latest', _MAX_MESSAGES, max_bytes)
         self._arrived = Event()
-        self.newest = -np.inf
+        self.newest: Moment | None = None
 
     def put(self, what: str, message: Any, size: int) -> None:
         """Queue a message of some bytes for the tracker's method ``what``."""
-        self.newest = monotonic()
-        self._queue.put(_Queued(what, message, self.newest), size)
+        self.newest = at = self._stopwatch.now()
+        self._queue.put(_Queued(what, message, at), size)
         self._arrived.set()
 
     def feed(self, tracker: Tracker, until: float) -> None:
-        """Pass the messages that arrived until a time to the tracker, which keeps a few."""
-        while self.feed_next(tracker, until):
+        """
+        Pass the messages that arrived until a time to the tracker, which keeps a few.
+
+        until: by the machine's clock (monotonic seconds).
+        """
+        while self.feed_next(tracker, lambda at: at.machine <= until):
             pass
 
-    def feed_next(self, tracker: Tracker, until: float) -> bool:
-        """Pass the oldest message to the tracker if it arrived until a time; return whether."""
+    def feed_next(self, tracker: Tracker, wanted: Callable[[Moment], bool]) -> bool:
+        """Pass the oldest message to the tracker if its arrival is wanted; return whether."""
         waiting = self._queue.peek()
-        if waiting is None or waiting.at > until:
+        if waiting is None or not wanted(waiting.at):
             return False
         if (one := self._queue.get(timeout=0)) is None:
             return False

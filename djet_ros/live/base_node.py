@@ -154,6 +154,10 @@ class LiveNode:
         output = self._outputs.get(topic)
         return output is not None and bool(output.listeners)
 
+    def now_ns(self) -> int:
+        """Return the time of the node's clock in nanoseconds, which may be simulated."""
+        return self._middleware.now_ns()
+
     def transform(self, parent: str, child: str) -> Array | None:
         """Return the pose (4, 4) of frame child in parent, or None if tf does not have it yet."""
         return self._middleware.transform(parent, child)

@@ -36,6 +36,9 @@ class Wiring(Protocol):
     def wants(self, topic: str) -> bool:
         """Return whether an output that is made on demand has subscribers."""
 
+    def now_ns(self) -> int:
+        """Return the time of the node's clock in nanoseconds, which may be simulated."""
+
     def transform(self, parent: str, child: str) -> Array | None:
         """Return the pose (4, 4) of frame child in parent, or None if tf does not have it yet."""
 

@@ -18,6 +18,7 @@ from djet_ros.live.auxiliary_queue import AuxiliaryQueue
 from djet_ros.live.frame_queue import FrameQueue
 from djet_ros.live.rate_limit import RateLimit
 from djet_ros.live.reporting import Latencies, SILENCE_TIMEOUT, Throttle, Wiring
+from djet_ros.live.stopwatch import elapsed, Moment, Stopwatch
 from djet_ros.odometry.health import Complaint, REDUCE_LOAD
 from djet_ros.odometry.messages import frame_of, stamp_ns
 from djet_ros.odometry.state import LEVELS, State
@@ -34,7 +35,8 @@ MAX_QUEUE_BYTES = 500_000_000
 # Approximate size of a message in bytes without its pixels.
 _MESSAGE_OVERHEAD = 4_000
 
-# Seconds for which an image waits for its auxiliary inputs, such as gyro rates and mask.
+# Seconds for which an image waits for its auxiliary inputs, such as gyro rates and mask; these and
+# the next two by a Stopwatch.
 _AUXILIARY_TIMEOUT = 0.1
 
 # With queue_policy 'every' that wait restarts with each auxiliary input, up to this in total.
@@ -48,11 +50,11 @@ _LOGGED_ELSEWHERE = (State.PAUSED, State.WAITING_FOR_IMAGE, State.WAITING_FOR_CA
 
 
 class _Received(NamedTuple):
-    """An image with the newest CameraInfo and the time (monotonic seconds) at its arrival."""
+    """An image with the newest CameraInfo at its arrival, and the moment of that."""
 
     image: Any
     info: Any
-    at: float
+    at: Moment
 
 
 class Session:
@@ -78,7 +80,8 @@ class Session:
         self._turnstile = Lock()
         self._newest_info: Any = None
         self._taken_info: Any = None
-        self._auxiliary = AuxiliaryQueue(MAX_QUEUE_BYTES)
+        self._stopwatch = Stopwatch(wiring.now_ns)
+        self._auxiliary = AuxiliaryQueue(self._stopwatch, MAX_QUEUE_BYTES)
         self._counted_drops = self._lost = self._counted_lost = self._skipped = 0
         self._drops_logged = False
         self._latencies = Latencies()
@@ -125,11 +128,12 @@ class Session:
 
     def image(self, message: Any) -> None:
         """Queue an Image or CompressedImage, unless ros.max_rate skips it."""
-        self._last_image = monotonic()
+        at = self._stopwatch.now()
+        self._last_image = at.machine
         if not self._limit.takes(stamp_ns(message.header)):
             self._skipped += 1
             return
-        self._queue.put(_Received(message, self._newest_info, self._last_image), _bytes(message))
+        self._queue.put(_Received(message, self._newest_info, at), _bytes(message))
 
     def camera_info(self, message: Any) -> None:
         """Take a CameraInfo for the images that arrive after it."""
@@ -271,7 +275,7 @@ class Session:
                 with self._turnstile:
                     pass
                 with self._lock:
-                    if received.at > self._forgotten:
+                    if received.at.machine > self._forgotten:
                         self._process(received)
         finally:
             # Nothing processes what arrives from now on.
@@ -295,7 +299,7 @@ class Session:
         before = tracker.counts.processed
         self._publish(tracker.image(received.image, following))
         if tracker.counts.processed > before:
-            self._latencies.add(received.at)
+            self._latencies.add(received.at.machine)
         self._log_problem()
         for topic, make in (('debug_image', tracker.debug_image),
                             ('landmarks', tracker.landmarks)):
@@ -304,19 +308,22 @@ class Session:
 
     def _wait_for_auxiliary(self, received: _Received) -> None:
         """Wait briefly for the auxiliary inputs of an image that have not arrived yet."""
-        inputs = self._auxiliary
+        inputs, stopwatch = self._auxiliary, self._stopwatch
         # With 'every' on a slow machine, auxiliary inputs arrive late, but keep arriving.
         patient = self._tracker.config.ros.queue_policy == 'every'
-        latest = monotonic() + _MAX_AUXILIARY_TIMEOUT
-        while not self._stopping and received.at > self._forgotten:
+        start = stopwatch.now()
+        while not self._stopping and received.at.machine > self._forgotten:
             inputs.expect()
             with self._lock:
                 inputs.feed(self._tracker, self._auxiliary_cutoff(received))
                 while (lacking := self._tracker.needs(received.image)) and inputs.feed_next(
-                        self._tracker, received.at + _MAX_AUXILIARY_TIMEOUT):
+                        self._tracker, lambda at: elapsed(
+                            received.at, at) <= _MAX_AUXILIARY_TIMEOUT):
                     pass
-            since = max(received.at, inputs.newest) if patient else received.at
-            left = min(since + _AUXILIARY_TIMEOUT, latest) - monotonic()
+            newest = inputs.newest
+            since = received.at if newest is None or not patient else max(received.at, newest)
+            left = min(stopwatch.left(since, _AUXILIARY_TIMEOUT),
+                       stopwatch.left(start, _MAX_AUXILIARY_TIMEOUT))
             if not lacking or left <= 0:
                 return
             inputs.wait(left)
@@ -324,12 +331,15 @@ class Session:
     def _wait_for_next_if_ahead(self, received: _Received) -> None:
         with self._lock:
             leaps = self._tracker.follows_gap(received.image)
-        if leaps and received.at > self._forgotten:
-            self._queue.peek(timeout=_NEXT_IMAGE_TIMEOUT)
+        start = self._stopwatch.now()
+        while (leaps and received.at.machine > self._forgotten and not self._stopping
+               and (left := self._stopwatch.left(start, _NEXT_IMAGE_TIMEOUT)) > 0
+               and self._queue.peek(timeout=left) is None):
+            pass
 
     def _auxiliary_cutoff(self, received: _Received) -> float:
         """Return the arrival time after which auxiliary inputs are for later images."""
-        return received.at if len(self._queue) else np.inf
+        return received.at.machine if len(self._queue) else np.inf
 
     def _mount_auxiliary(self, image_frame: str) -> None:
         for what, (parent, child) in self._tracker.missing_mountings(image_frame).items():

@@ -7,7 +7,7 @@ raises BadMessage, with a reason to count it by.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 import struct
@@ -257,31 +257,57 @@ def _declared_size(raw: bytes) -> tuple[int, int]:
             width, height = struct.unpack('>II', raw[16:24])
             return width, height
     if JPEG_START.startswith(raw[:2]):
-        # Decoders fill a truncated image with gray. Cameras pad the end with zeros.
-        if b'\xff\xd9' not in raw[-4096:]:
-            raise BadMessage('undecodable', f'JPEG image of {len(raw)} bytes is cut short')
-        # Each scan costs a pass over the whole image, and may have a few bytes only.
-        if (scans := raw.count(b'\xff\xda')) > _MOST_SCANS:
-            raise BadMessage('undecodable', f'JPEG image has {scans} scans, at most {_MOST_SCANS} '
-                             'are decoded')
-        return jpeg_size(raw)
+        size = jpeg_size(raw)
+        _check_scans(raw)
+        return size
     raise BadMessage('unknown_encoding', 'compressed image is neither JPEG nor PNG')
 
+
+_START_OF_SCAN, _END_OF_IMAGE = 0xda, 0xd9
 
 # Start-of-frame markers of JPEG, which are followed by its size.
 _START_OF_FRAME = set(range(0xc0, 0xd0)) - {0xc4, 0xc8, 0xcc}
 
 
-def jpeg_size(raw: bytes) -> tuple[int, int]:
-    """Return (width, height) that the header of a JPEG file declares; raises BadMessage."""
+def _jpeg_segments(raw: bytes) -> Iterator[tuple[int, int]]:
+    """Yield marker and position (of its 0xff) of the segments of a JPEG file before its pixels."""
     at = 2
     while at + 9 <= len(raw) and raw[at] == 0xff:
         marker = raw[at + 1]
         if marker == 0xff:
             at += 1
             continue
+        yield marker, at
+        if marker == _START_OF_SCAN:
+            return
+        at += 2 + max(int.from_bytes(raw[at + 2:at + 4], 'big'), 2)
+
+
+def jpeg_size(raw: bytes) -> tuple[int, int]:
+    """Return (width, height) that the header of a JPEG file declares; raises BadMessage."""
+    for marker, at in _jpeg_segments(raw):
         if marker in _START_OF_FRAME:
             height, width = struct.unpack('>HH', raw[at + 5:at + 9])
             return width, height
-        at += 2 + max(int.from_bytes(raw[at + 2:at + 4], 'big'), 2)
     raise BadMessage('undecodable', 'JPEG image has no header with its size')
+
+
+def _check_scans(raw: bytes) -> None:
+    """
+    Raise BadMessage unless the pixels of a JPEG file have an end, and a usual number of scans.
+
+    Neither the end of a thumbnail in the header counts, nor what follows the image: zeros of a
+    camera, or the video of a motion photo. Pixels never contain a marker.
+    """
+    pixels = next((_bytes(raw[at:]) for marker, at in _jpeg_segments(raw)
+                   if marker == _START_OF_SCAN), np.empty(0, np.uint8))
+    markers = pixels[1:][pixels[:-1] == 0xff]
+    ends = np.flatnonzero(markers == _END_OF_IMAGE)
+    if not len(ends):
+        # Decoders fill what is missing with gray.
+        raise BadMessage('undecodable', f'JPEG image of {len(raw)} bytes is cut short')
+    # Each scan costs a pass over the whole image, and may have a few bytes only.
+    scans = np.count_nonzero(markers[:ends[0]] == _START_OF_SCAN)
+    if scans > _MOST_SCANS:
+        raise BadMessage('undecodable', f'JPEG image has {scans} scans, at most {_MOST_SCANS} '
+                         'are decoded')
