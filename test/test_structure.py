@@ -11,7 +11,6 @@ from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import rotation_exp, rotation_log, sphere_tangents
 from djet_ros.core.landmark_choice import choose_landmarks, PATCH, surrounding_means
-from djet_ros.core.self_calibration import SelfCalibration
 from djet_ros.core.types import Pose, RelativePose, Rival, Status, TRACKED
 from djet_ros.core.window import Window, WINDOW_TUNING, WindowStep
 from djet_ros.lab.scenes import make_scene
@@ -764,7 +763,7 @@ def test_a_rotation_without_landmarks_has_the_uncertainty_of_a_usual_step(source
     scale = TrackScale()
     scale.configure(ESTIMATOR, source, 0.0)
     scale._window = SimpleNamespace(
-        is_new=False, lens=SelfCalibration.unknown(np.eye(3), (2, 2)),
+        is_new=False, determines_translation=True,
         record_published=lambda motion: None, add=lambda view, relative, guess: added.pop(0))
     known = {'covariance_5': np.eye(5) * 1e-8, 'covariance_6': np.eye(6) * 1e-8}
     scale.of_step((0, 10**8), None, RelativePose(Status.OK, t=ahead, **known))
@@ -785,7 +784,7 @@ def test_motion_and_covariances_without_parallax_are_those_of_the_window():
     scale = TrackScale()
     scale.configure(ESTIMATOR, RelativeScale(), 0.0)
     scale._window = SimpleNamespace(
-        is_new=False, lens=SelfCalibration.unknown(np.eye(3), (2, 2)),
+        is_new=False, determines_translation=True,
         record_published=lambda motion: None, add=lambda view, relative, guess: added.pop(0))
     known = {'covariance_5': np.eye(5), 'covariance_6': np.eye(6)}
     scale.of_step((0, 10**8), None, RelativePose(Status.OK, t=ahead, **known))
@@ -820,7 +819,7 @@ def factors(metres, alike):
     scale.configure(ESTIMATOR, Ground(metres, alike), 0.0)
     # A window with steps of constant length, with a sigma of 0.2 %.
     scale._window = SimpleNamespace(
-        is_new=False, lens=SelfCalibration.unknown(np.eye(3), (2, 2)),
+        is_new=False, determines_translation=True,
         record_published=lambda motion: None, add=lambda view, relative, guess: step)
     ahead = RelativePose(Status.OK, t=np.array([0, 0, -1.0]), covariance_6=np.eye(6) * 1e-12)
     found = []

@@ -229,8 +229,8 @@ def test_no_rotation_is_certain_of_what_a_translation_along_a_wall_explains_as_w
 
 @pytest.mark.parametrize('slope', [0.0, 0.2, 0.5])
 def test_nor_if_the_wall_is_seen_askew(slope: float) -> None:
-    rng = np.random.default_rng(4)
-    for _ in range(40):
+    rng, squares = np.random.default_rng(4), []
+    for _ in range(200):
         x = rng.uniform((0, 0), SIZE, (400, 2))
         wall = np.column_stack([x, np.ones(400)]) @ np.linalg.inv(K).T
         wall /= 1 + slope * wall[:, :1]
@@ -239,7 +239,9 @@ def test_nor_if_the_wall_is_seen_askew(slope: float) -> None:
         turn = estimate(pair_of(x, y + rng.normal(0, 0.05, y.shape)))
         assert turn.status is Status.NO_PARALLAX
         off = rotation_log(turn.R @ R.T)
-        assert off @ np.linalg.solve(turn.covariance_5[:3, :3], off) < CHI2_999_OF_ROTATION
+        squares.append(off @ np.linalg.solve(turn.covariance_5[:3, :3], off))
+    # Of correct covariances three or more of 200 are beyond in one of a thousand such tests.
+    assert sum(np.array(squares) > CHI2_999_OF_ROTATION) < 3
 
 
 def test_the_noise_of_matches_is_no_parallax_that_tells_the_direction_along_a_wall() -> None:

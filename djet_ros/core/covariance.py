@@ -113,10 +113,7 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     eigenvalues = np.linalg.eigvalsh(H)
     if eigenvalues[0] <= 1e-12 * eigenvalues[-1]:
         return UNDETERMINED
-    curved = _loss_curvature(H, (J * loss.curvature(squared)) @ J.T)
-    # Second derivatives of outliers do not make a minimum of what is none by the inliers.
-    if curved is not None and hessian is not None:
-        curved = _loss_curvature(H, hessian)
+    curved = _curvature_at(residuals, loss, H, hessian)
     cells, pulls, products = _summed_by_cell(H, places, J, weights, residuals.r)
     large = cells.in_larger(max(np.sqrt(np.ptp(places, axis=0).prod() / LARGE_CELLS), CELL))
     if curved is None or not (cells.determine_pose() and large.determine_pose()):
@@ -179,7 +176,7 @@ def widened_by_profile(covariance: Array, problem: JetProblem, pose: Pose, loss:
     if hessian is None:
         hessian = loss_hessian(problem, pose, residuals, loss)
     J = residuals.jacobian
-    curved = _loss_curvature((J * loss(residuals.r**2)[1]) @ J.T, hessian)
+    curved = _curvature_at(residuals, loss, (J * loss(residuals.r**2)[1]) @ J.T, hessian)
     variances, axes = np.linalg.eigh(covariance)
     if curved is None or variances[0] <= 0:
         return covariance
@@ -211,6 +208,23 @@ def calibration_covariance(problem: JetProblem, K: Array, pose: Pose, residuals:
     shifts = np.linalg.solve(weighted @ J.T, weighted @ np.transpose(changes))
     lifted = lift(-residuals.tangents if flipped else residuals.tangents) @ shifts
     return np.asarray(lifted @ lifted.T)
+
+
+def _curvature_at(residuals: Residuals, loss: Loss, H: Array, hessian: Array | None
+                  ) -> Array | None:
+    """
+    Return the curvature (5, 5) of a loss at a pose, None if it is not positive by the inliers.
+
+    H: (5, 5) weighted; hessian: (5, 5) with the second derivatives of the residuals, if known.
+    They do not make a minimum of what is none by the inliers. And of a pose that was not optimised
+    they may leave none, where the inliers have one nearby.
+    """
+    J = residuals.jacobian
+    curved = _loss_curvature(H, (J * loss.curvature(residuals.r**2)) @ J.T)
+    if curved is None or hessian is None:
+        return curved
+    with_second = _loss_curvature(H, hessian)
+    return curved if with_second is None else with_second
 
 
 def _loss_curvature(H: Array, curvature: Array) -> Array | None:

@@ -184,6 +184,11 @@ class Window:
         return self.is_new or self._is_due
 
     @property
+    def determines_translation(self) -> bool:
+        """Return whether the newest frame observes the two landmarks that it takes at least."""
+        return int(self._joint.landmarks.observed[:, -1].sum()) > 1
+
+    @property
     def is_keyframe(self) -> bool:
         """Return whether the newest frame is a keyframe, or has made the one before it one."""
         return self._is_keyframe[-1] or self._became_keyframe

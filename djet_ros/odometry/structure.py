@@ -265,7 +265,8 @@ class TrackScale:
                 addition = None
             if self._calibration is not None:
                 self._calibration = self._window.calibration
-            if addition is not None and np.isfinite(addition.sigma) and addition.length > 0:
+            if (addition is not None and np.isfinite(addition.sigma) and addition.length > 0
+                    and (relative.t.any() or self._window.determines_translation)):
                 self._filter.add_noise(noise**2)
                 self._interrupted = False
                 return addition
