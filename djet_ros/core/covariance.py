@@ -170,11 +170,10 @@ def widened_by_profile(covariance: Array, problem: JetProblem, pose: Pose, loss:
     So the loss is evaluated where each axis of the ellipsoid meets the 95 % bound, on both sides:
     if it has risen by a share of what a parabola would have on either side, the standard deviation
     is divided by that share. (Profile likelihoods, as in Bates and Watts, Nonlinear Regression
-    Analysis, chapter 6.) residuals, hessian: those at the pose, if known.
+    Analysis, chapter 6.) residuals: those at the pose, if known; hessian: as for
+    `pose_covariance`.
     """
     residuals = residuals or epipolar_residuals(problem, pose.R, pose.t)
-    if hessian is None:
-        hessian = loss_hessian(problem, pose, residuals, loss)
     J = residuals.jacobian
     curved = _curvature_at(residuals, loss, (J * loss(residuals.r**2)[1]) @ J.T, hessian)
     variances, axes = np.linalg.eigh(covariance)
