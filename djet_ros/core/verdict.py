@@ -57,9 +57,9 @@ _RANDOM_BITS = 112
 # Factor by which parallax has to exceed the noise of the matches.
 _PARALLAX_OVER_NOISE = 3.0
 
-# And factor beyond which that noise is no part of the information about t, to 2 % of standard
-# deviations in rendered and real scenes: the share falls with the square.
-_FAR_OVER_NOISE = 200.0
+# And factor beyond which that noise is no part of the information about t, to 5 % of nearly all
+# standard deviations in rendered and real scenes: the share falls with the square.
+_FAR_OVER_NOISE = 50.0
 
 # chosen: factor by which preferences overstate the evidence, as neighbouring cells have correlated
 # errors too. The probability of a rival takes it into account, the status does not.
