@@ -9,7 +9,14 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from djet_ros.core.geometry import fit_rotation, norms, rays, rotation_exp, sphere_tangents
+from djet_ros.core.geometry import (
+    displaced_by_turn,
+    fit_rotation,
+    norms,
+    rays,
+    rotation_exp,
+    sphere_tangents,
+)
 from djet_ros.core.medians import median
 from djet_ros.core.types import Array, RelativePose
 import numpy as np
@@ -116,10 +123,9 @@ def _turned(R: Array, deviation: Array, x: Array, y: Array, by_x: Array) -> tupl
     """
     turned = x @ R[:, :2].T + R[:, 2]
     places = turned[:, :2] / turned[:, 2:]
-    (u, v), one = places.T, np.ones(len(x))
-    by_turn = np.stack([-u * v, one + u * u, -v, -one - v * v, u * v, u], axis=1)
+    by_turn = np.array(displaced_by_turn(*places.T)).transpose(2, 0, 1)
     by_place = (R[:2, :2] - places[:, :, None] * R[2, :2]) / turned[:, 2:, None]
     # Both places are seen displaced: y where the true one of x would be brought.
     by_camera = displacements(places) - by_place @ by_x
     return (y - places - by_camera @ deviation,
-            np.concatenate([by_turn.reshape(-1, 2, 3), by_camera], axis=2))
+            np.concatenate([by_turn, by_camera], axis=2))

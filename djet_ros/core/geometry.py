@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 from djet_ros import compiled
 from djet_ros.core.medians import median
-from djet_ros.core.types import Array
+from djet_ros.core.types import Array, RelativePose
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -148,6 +148,12 @@ def line_values(lines: Array, y: Array) -> Array:
     return np.asarray(lines[:, 0] * y[:, 0] + lines[:, 1] * y[:, 1] + lines[:, 2])
 
 
+def inlier_rays(relative: RelativePose, K: Array) -> tuple[Array, Array]:
+    """Return rays (N, 3) of a pair's inliers in both images, at refined places; K: (3, 3)."""
+    inliers = relative.inliers
+    return rays(K, relative.x[inliers]), rays(K, relative.placed[inliers])
+
+
 def fit_rotation(rays_x: Array, rays_y: Array, rounds: int = 5) -> Array:
     """
     Fit a rotation R (3, 3) that brings rays x (N, 3) to rays y (N, 3), robustly.
@@ -169,6 +175,12 @@ def fit_rotation(rays_x: Array, rays_y: Array, rounds: int = 5) -> Array:
     return R
 
 
+def displaced_by_turn(x: Array, y: Array) -> tuple[Array, Array]:
+    """Return the derivatives (3, N) of x = X/Z, and of y = Y/Z, (N,) each, by a rotation."""
+    one = np.ones_like(x)
+    return (np.array([-x * y, one + x * x, -y]), np.array([-one - y * y, x * y, x]))
+
+
 def turn_before_plane(rays_x: Array, rays_y: Array, rounds: int = 5) -> tuple[Array, Array]:
     """
     Return the rotation vector (3,) of a small motion in front of a plane, and its covariance.
@@ -180,7 +192,7 @@ def turn_before_plane(rays_x: Array, rays_y: Array, rounds: int = 5) -> tuple[Ar
     """
     (x, y), seen = ((rays[:, :2] / rays[:, 2:]).T for rays in (rays_x, rays_y))
     one, none = np.ones_like(x), np.zeros_like(x)
-    by_turn = np.concatenate([[-x * y, 1 + x * x, -y], [-1 - y * y, x * y, x]], axis=1)
+    by_turn = np.concatenate(displaced_by_turn(x, y), axis=1)
     by_shift = np.concatenate([[one, none, -x], [none, one, -y]], axis=1)
     xy, offsets = np.tile([x, y], 2), (seen - [x, y]).ravel()
     w, v, slopes = np.zeros(3), np.zeros(3), np.zeros(2)

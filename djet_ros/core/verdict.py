@@ -25,6 +25,7 @@ from djet_ros.core.geometry import (
     epipolar_lines,
     fit_rotation,
     fundamental,
+    inlier_rays,
     line_distances,
     norms,
     rays,
@@ -184,8 +185,7 @@ def as_pure_rotation(relative: RelativePose, K: Array) -> RelativePose:
 
     The covariance is that of `_of_rotation_alone`.
     """
-    rays_x, rays_y = (rays(K, places[relative.inliers])
-                      for places in (relative.x, relative.placed))
+    rays_x, rays_y = inlier_rays(relative, K)
     R = fit_rotation(rays_x, rays_y)
     covariance = _of_rotation_alone(relative.covariance_5, relative.R, R, rays_x, rays_y)
     lines = epipolar_lines(fundamental(K, R, relative.t), relative.x)

@@ -19,6 +19,7 @@ from djet_ros.core.bundle import Landmarks, projected
 from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import (
     fit_rotation,
+    inlier_rays,
     inverse_depths,
     norms,
     rays,
@@ -336,9 +337,7 @@ class Window:
         """
         if not relative.inliers.any():
             return relative.R
-        rays_x, rays_y = (rays(self._joint.K, places[relative.inliers])
-                          for places in (relative.x, relative.placed))
-        return fit_rotation(rays_x, rays_y)
+        return fit_rotation(*inlier_rays(relative, self._joint.K))
 
     def _measured(self, relative: RelativePose) -> _Measured | None:
         """Return the length by points of known depth; None for few of them."""

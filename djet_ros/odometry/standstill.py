@@ -94,8 +94,8 @@ class Standstill:
         """
         if not len(relative.x) or (not at_rest and self._hidden > _LONGEST_HIDDEN):
             return False
-        held = _held_in_place(relative, K, threshold)
-        if not at_rest and held.sum() > _is_still(relative, threshold).sum() / 2:
+        if not at_rest and (2 * _held_in_place(relative, K, threshold).sum()
+                            > _is_still(relative, threshold).sum()):
             return False
         apart = self._is_apart(relative.x)
         if _nothing_moves(relative, apart, threshold):
