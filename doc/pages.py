@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 import json
 from pathlib import Path
 import re
+from statistics import median
 import sys
 import textwrap
 from typing import Any
@@ -362,7 +363,8 @@ def drift(results: Any) -> str:
                       'ground truth:')
             + table(('', 'method', 't_rel, %', 'r_rel, ° per 100 m'), chained) + '\n'
             + paragraph('`djet replay`, with its own translation lengths. ATE after alignment, '
-                        'with scale unless it is metric:')
+                        'with scale unless it is metric. Medians (worst) of replays that begin at '
+                        'the first frame, the second, and so on to the fifth:')
             + table(('', *OF_REPLAY), replays))
 
 
@@ -383,11 +385,15 @@ def lens(results: Any) -> str:
     return text or 'No drive shows a distortion that is worth correcting.\n'
 
 
-def replay(one: Any) -> tuple[str, ...]:
-    """Return the figures of a replay in the order of OF_REPLAY."""
-    return (number(one['positions']['rmse_m'], 2), number(one['positions']['scale_change']),
-            number(one['drift']['translation_percent'], 2),
-            number(one['drift']['rotation_deg_per_100m']))
+def replay(ones: Any) -> tuple[str, ...]:
+    """Return the figures of replays, medians and the worst, in the order of OF_REPLAY."""
+    return tuple(
+        f'{number(median(values), places)} '
+        f'({number(max(values, key=lambda value: abs(value - best)), places)})'
+        for what, name, best, places in (
+            ('positions', 'rmse_m', 0.0, 2), ('positions', 'scale_change', 1.0, 3),
+            ('drift', 'translation_percent', 0.0, 2), ('drift', 'rotation_deg_per_100m', 0.0, 3))
+        for values in [[one[what][name] for one in ones]])
 
 
 def surprise(results: Any) -> str:
