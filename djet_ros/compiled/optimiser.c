@@ -1,5 +1,6 @@
 /* The joint optimiser: residuals and steps are those of core/jet.py, those of many starts of
-   core/sketch.py. Sums over matches have another order here, and round differently. */
+   core/sketch.py. Sums over matches have another order here, and derivatives another form, so both
+   round differently. */
 #include <string.h>
 
 #include "common.h"
