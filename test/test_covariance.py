@@ -7,6 +7,7 @@ from pathlib import Path
 from cards import Cards, K as CARDS_K, pose as card_pose
 from djet_ros.core.covariance import (
     calibration_covariance,
+    curvature_at,
     loss_hessian,
     pose_covariance,
     widened_by_profile,
@@ -266,14 +267,17 @@ def test_profile_widens_where_matches_become_outliers(share, least, most):
     surface = ReprojectionSurface(views.x, views.y)
     problem = jet_problem(views.K, views.x, surface.fit_around(views.y))
     loss, pose = Loss('geman_mcclure', 0.3), Pose(views.R, views.t)
-    J = epipolar_residuals(problem, views.R, views.t).jacobian
+    residuals = epipolar_residuals(problem, views.R, views.t)
+    J = residuals.jacobian
     # The noise is a tenth of the scale of the loss: the bound is within it, or far beyond.
     claimed = np.linalg.inv(J @ J.T) * (0.03 * share)**2
-    estimated = widened_by_profile(claimed, problem, pose, loss)
+    estimated = widened_by_profile(claimed, problem, pose, loss, residuals,
+                                   curvature_at(residuals, loss))
     wider = np.linalg.eigvals(np.linalg.solve(claimed, estimated)).real
     assert wider.min() > least - 1e-9 and wider.max() < most
     # A sum of squares rises as its curvature predicts, for small differences of the pose.
-    squares = widened_by_profile(claimed, problem, pose, Loss())
+    squares = widened_by_profile(claimed, problem, pose, Loss(), residuals,
+                                 curvature_at(residuals, Loss()))
     assert np.allclose(np.linalg.eigvals(np.linalg.solve(claimed, squares)).real, 1, atol=0.2)
 
 
@@ -310,7 +314,9 @@ def test_a_pose_off_its_minimum_is_widened_towards_either_side(direction):
     for variance, axis in zip(variances, axes.T):
         pose = Pose(*retract(views.R, views.t, residuals.tangents,
                              direction * np.sqrt(variance) * axis))
-        estimated = widened_by_profile(claimed, problem, pose, Loss())
+        there = epipolar_residuals(problem, pose.R, pose.t)
+        estimated = widened_by_profile(claimed, problem, pose, Loss(), there,
+                                       curvature_at(there, Loss()))
         assert axis @ estimated @ axis > 50 * variance
 
 

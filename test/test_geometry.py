@@ -17,6 +17,7 @@ from djet_ros.core.geometry import (
     line_distances,
     norms,
     patch_warp,
+    quaternion,
     rays,
     rotation_angle,
     rotation_exp,
@@ -68,6 +69,16 @@ def test_vectorised_functions_agree_with_single_calls():
     v = np.random.default_rng(2).normal(size=(7, 3))
     assert np.allclose(rotation_exp(v), [rotation_exp(one) for one in v], atol=1e-14)
     assert (sphere_tangents(unit(v)) == [sphere_tangents(unit(one)) for one in v]).all()
+
+
+@given(directions, st.floats(-np.pi, np.pi))
+@example(np.array([0.0, 1.0, 0.0]), np.pi)
+@example(np.array([0.0, 0.0, 1.0]), 0.0)
+def test_a_quaternion_makes_its_rotation_again(axis, angle):
+    R = Rotation.from_rotvec(angle * axis).as_matrix()
+    found = quaternion(R)
+    assert found[3] >= 0 and norms(np.array(found)) == pytest.approx(1, abs=1e-15)
+    assert Rotation.from_quat(found).as_matrix() == pytest.approx(R, abs=1e-15)
 
 
 @given(directions)

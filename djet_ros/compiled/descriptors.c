@@ -40,9 +40,10 @@ WIDE void djet_match_distances(const uint8_t *previous, const uint8_t *current, 
         const uint8_t *a = pixel_at(previous, height, width, x[k], reach),
                       *b = pixel_at(current, height, width, y[k], reach);
         int differing = 0;
+        /* Outcomes are the signs of differences. */
         for (int t = 0; a && b && t < TESTS; t++)
-            differing += (a[ends.first[t]] < a[ends.second[t]])
-                         != (b[ends.first[t]] < b[ends.second[t]]);
+            differing += ((a[ends.first[t]] - a[ends.second[t]])
+                          ^ (b[ends.first[t]] - b[ends.second[t]])) < 0;
         distances[k] = a && b ? differing : NAN;
     }
 }

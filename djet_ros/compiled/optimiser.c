@@ -1,5 +1,6 @@
 /* The joint optimiser: residuals and steps are those of core/jet.py, those of many starts of
-   core/sketch.py. Sums over matches have another order here, and round differently. */
+   core/sketch.py. Sums over matches have another order here, and derivatives another form, so both
+   round differently. */
 #include <string.h>
 
 #include "common.h"
@@ -9,6 +10,7 @@ enum { NONE, HUBER, CAUCHY, GEMAN_MCCLURE };
 /* Matches computed in parallel; rows are padded with matches without effect. */
 enum { LANES = 4 };
 typedef double Lanes __attribute__((vector_size(LANES * sizeof(double))));
+typedef int64_t Choice __attribute__((vector_size(LANES * sizeof(int64_t))));
 
 /* Rays x and y* (3, m), spread (3, m) and blur (m,) of matches, m a multiple of LANES. */
 typedef struct {
@@ -43,18 +45,23 @@ INLINE void store(double *values, Lanes lanes)
     memcpy(values, &lanes, sizeof lanes);
 }
 
+INLINE Lanes chosen(Choice choice, Lanes yes, Lanes no)
+{
+    return (Lanes)((choice & (Choice)yes) | (~choice & (Choice)no));
+}
+
 INLINE Lanes larger(Lanes a, Lanes b)
 {
-    for (int l = 0; l < LANES; l++)
-        a[l] = a[l] > b[l] ? a[l] : b[l];
-    return a;
+    return chosen(a > b, a, b);
 }
 
 INLINE Lanes roots(Lanes values)
 {
+    double each[LANES];
+    store(each, values);
     for (int l = 0; l < LANES; l++)
-        values[l] = sqrt(values[l]);
-    return values;
+        each[l] = sqrt(each[l]);
+    return load(each);
 }
 
 INLINE double sum_of(Lanes values)
@@ -85,83 +92,82 @@ static void sphere_tangents(const double t[3], double tangents[2][3])
     memcpy(tangents, values, sizeof values);
 }
 
-/* Derivatives of E = [t]_x R by a pose's five parameters. */
-static void derivatives_of(const Pose *pose, const double tangents[2][3], double slopes[5][9])
+INLINE Lanes dot(const Lanes a[3], const Lanes b[3])
 {
-    double T[3][3], S[3][3], rotated[3][3];
-    cross_matrix(pose->t, T);
-    for (int k = 0; k < 5; k++) {
-        if (k < 3) {
-            const double axis[3] = {k == 0, k == 1, k == 2};
-            cross_matrix(axis, S);
-            multiply((const double (*)[3])S, pose->R, rotated);
-            multiply((const double (*)[3])T, (const double (*)[3])rotated,
-                     (double (*)[3])slopes[k]);
-        } else {
-            cross_matrix(tangents[k - 3], S);
-            multiply((const double (*)[3])S, pose->R, (double (*)[3])slopes[k]);
-        }
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+INLINE void cross(const Lanes a[3], const Lanes b[3], Lanes product[3])
+{
+    for (int i = 0; i < 3; i++) {
+        const int j = (i + 1) % 3, k = (i + 2) % 3;
+        product[i] = a[j] * b[k] - a[k] * b[j];
     }
 }
 
+INLINE void in_all_lanes(const double v[3], Lanes all[3])
+{
+    for (int i = 0; i < 3; i++)
+        all[i] = (Lanes){0} + v[i];
+}
+
 /* Compute the residuals at a pose, and J on demand, which includes the derivative of the
-   variances if `exact`. */
+   variances if `exact`. With m = R x and w the weighted y, w . (t x m) has the derivatives
+   m x (w x t) by the rotation and m x w by t. */
 INLINE void residuals_at(const Problem *problem, const Pose *pose, const double tangents[2][3],
                          int exact, int with_J, Residuals *residuals)
 {
-    double T[3][3], E[3][3], slopes[5][9];
-    cross_matrix(pose->t, T);
-    multiply((const double (*)[3])T, pose->R, E);
-    derivatives_of(pose, tangents, slopes);
-    const int m = problem->m;
-    for (int k = 0; k < m; k += LANES) {
-        const double *rays_x = problem->x + k, *rays_y = problem->y + k,
-                     *spread = problem->spread + k;
-        const Lanes x[3] = {load(rays_x), load(rays_x + m), load(rays_x + 2 * m)};
-        const Lanes y[3] = {load(rays_y), load(rays_y + m), load(rays_y + 2 * m)};
-        const Lanes s[3] = {load(spread), load(spread + m), load(spread + 2 * m)};
-        Lanes line[3];
+    Lanes t[3], directions[2][3];
+    in_all_lanes(pose->t, t);
+    for (int j = 0; j < 2; j++)
+        in_all_lanes(tangents[j], directions[j]);
+    const int count = problem->m;
+    for (int k = 0; k < count; k += LANES) {
+        Lanes x[3], y[3], s[3], m[3], line[3];
+        for (int i = 0; i < 3; i++) {
+            x[i] = load(problem->x + i * count + k);
+            y[i] = load(problem->y + i * count + k);
+            s[i] = load(problem->spread + i * count + k);
+        }
         for (int i = 0; i < 3; i++)
-            line[i] = E[i][0] * x[0] + E[i][1] * x[1] + E[i][2] * x[2];
+            m[i] = pose->R[i][0] * x[0] + pose->R[i][1] * x[1] + pose->R[i][2] * x[2];
+        cross(t, m, line);
         /* Covariance of the point times the line's normal. */
         const Lanes M[2] = {s[0] * line[0] + s[1] * line[1], s[1] * line[0] + s[2] * line[1]};
         const Lanes variance = line[0] * M[0] + line[1] * M[1], zero = {0};
-        Lanes sign;
-        for (int l = 0; l < LANES; l++)
-            sign[l] = variance[l] < 0 ? -1.0 : 1.0;
+        const Lanes sign = chosen(variance < 0, zero - 1.0, zero + 1.0);
         const Lanes size = larger(sign * variance + load(problem->blur + k), zero + 1e-24);
         const Lanes of = 1 / roots(size);
-        const Lanes r = (y[0] * line[0] + y[1] * line[1] + y[2] * line[2]) * of;
-        Lanes w[3] = {y[0] * of, y[1] * of, y[2] * of};
-        if (exact) {
-            const Lanes by_variance = r * sign / size;
-            w[0] -= by_variance * M[0];
-            w[1] -= by_variance * M[1];
-        }
+        const Lanes r = dot(y, line) * of;
         store(residuals->r + k, r);
         store(residuals->sign + k, sign);
         if (!with_J)
             continue;
-        Lanes products[9];
-        for (int i = 0; i < 9; i++)
-            products[i] = w[i / 3] * x[i % 3];
-        for (int j = 0; j < 5; j++) {
-            Lanes sum = slopes[j][0] * products[0];
-            for (int i = 1; i < 9; i++)
-                sum += slopes[j][i] * products[i];
-            store(residuals->J + j * m + k, sum);
+        Lanes w[3] = {y[0] * of, y[1] * of, y[2] * of};
+        if (exact) {
+            const Lanes by_variance = r * sign * of * of;
+            w[0] -= by_variance * M[0];
+            w[1] -= by_variance * M[1];
         }
+        Lanes by_t[3], turned[3], by_rotation[3];
+        cross(w, t, turned);
+        cross(m, turned, by_rotation);
+        cross(m, w, by_t);
+        for (int j = 0; j < 3; j++)
+            store(residuals->J + j * count + k, by_rotation[j]);
+        for (int j = 0; j < 2; j++)
+            store(residuals->J + (3 + j) * count + k, dot(directions[j], by_t));
     }
 }
 
 /* Sum the loss, and compute each match's weight and curvature: jet.Loss. */
 INLINE double cost_of(Loss loss, int m, Residuals *residuals)
 {
-    const double square = loss.scale * loss.scale;
+    const double square = loss.scale * loss.scale, per_square = 1 / square;
     const Lanes zero = {0}, one = zero + 1.0;
     Lanes sum = {0};
     for (int k = 0; k < m; k += LANES) {
-        const Lanes r = load(residuals->r + k), u = r * r / square;
+        const Lanes r = load(residuals->r + k), u = r * r * per_square;
         Lanes value = r * r, weight = one, curvature = one;
         if (loss.kind == GEMAN_MCCLURE) {
             const Lanes flat = 1 / (1 + u);

@@ -274,6 +274,8 @@ def lowest_nearby_minimum(problem: JetProblem, places: Array, solution: Solution
     refined = refine_all(subset, [solution.pose, *starts], loss, BASIN_TUNING.steps_nearby).poses()
     bound = BASIN_TUNING.same_minimum * len(problem.blur) / len(subset.blur)
     distinct = _distinct(refined, solution, information, bound)[1:]
+    if not distinct:
+        return solution, ()
     minima = [solution, *(minimise(problem, refined[index].R, refined[index].t, loss)
                           for index in distinct)]
     minima = [minima[index] for index in _distinct(
@@ -392,14 +394,15 @@ def _cheapest_basins(problem: JetProblem, sketch: Sketch, loss: Loss, most: int,
         if excluded[index]:
             continue
         chosen.append(index)
-        if len(chosen) == most:
+        excluded |= near[index]
+        if len(chosen) == most or excluded.all():
             break
         # A valley holds several poses that matches do not distinguish.
         information = _information(
             epipolar_residuals(problem, sketch.R[index], sketch.t[index]), loss)
         offsets = pose_differences(sketch.R[index], sketch.t[index], sketch.R, sketch.t)
         squared = _squared_distances(offsets, information)
-        excluded |= near[index] | (squared <= BASIN_TUNING.same_minimum)
+        excluded |= squared <= BASIN_TUNING.same_minimum
     return [sketch.pose(index) for index in chosen]
 
 

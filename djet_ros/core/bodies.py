@@ -229,8 +229,10 @@ def _of_other(places: Array, own: Array, other: Array) -> NDArray[np.bool_]:
     known, only_other = np.flatnonzero(fits_own | fits_other), fits_other & ~fits_own
     if not len(known):
         return only_other
-    around = only_other[known[_nearest(places[known], places)]].mean(1)
-    return np.asarray(only_other | (around > _SHARE))
+    of_other, rest = only_other.copy(), ~only_other
+    around = only_other[known[_nearest(places[known], places[rest])]]
+    of_other[rest] = around.mean(1) > _SHARE
+    return of_other
 
 
 def _is_significant(own: Array, other: Array) -> bool:

@@ -15,6 +15,7 @@ from djet_ros.core.geometry import (
     norms,
     rays,
     rotation_exp,
+    skew,
     sphere_tangents,
 )
 from djet_ros.core.medians import median
@@ -69,8 +70,8 @@ def motion_shift(pair: RelativePose, K: Array) -> Array:
     inliers = np.flatnonzero(pair.inliers)
     chosen = inliers[::max(len(inliers) // _MATCHES, 1)]
     x, y = (rays(K, points[chosen]) for points in (pair.x, pair.y_opt))
-    turned = x @ pair.R.T
-    normals, across = np.cross(pair.t, turned), np.cross(y, pair.t)
+    turned, T = x @ pair.R.T, skew(pair.t)
+    normals, across = turned @ T.T, y @ T
     by_motion = np.concatenate([np.cross(turned, across),
                                 np.cross(turned, y) @ sphere_tangents(pair.t)], axis=1)
     by_camera = -(np.einsum('ni,nia->na', across @ pair.R[:, :2], displacements(x[:, :2]))

@@ -89,15 +89,15 @@ _HEAVY = 0.9
 
 
 def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
-                    flipped: bool, hessian: Array | None = None) -> tuple[Array, Array]:
+                    flipped: bool, curved: Array | None = None) -> tuple[Array, Array]:
     """
     Return the covariance of (rotation vector in rad from the left, direction of t) at the minimum.
 
     places: (N, 2) pixels of the matches; t: (3,) the final direction, `flipped` if it is opposite
-    to the optimiser's; hessian: (5, 5) as of `loss_hessian`, without the curvature of residuals if
-    None. Returns the covariance (5, 5) in the basis ``sphere_tangents(t)``, and
-    (6, 6) over (rotation vector, t), of rank 5 because t has unit length. All NaN if the matches
-    do not determine the pose, if only those of one cell do, or if they lie in too few cells.
+    to the optimiser's; curved: (5, 5) as of `curvature_at`, if known. Returns the covariance
+    (5, 5) in the basis ``sphere_tangents(t)``, and (6, 6) over (rotation vector, t), of rank 5
+    because t has unit length. All NaN if the matches do not determine the pose, if only those of
+    one cell do, or if they lie in too few cells.
 
     The noise is estimated from the residuals, so it includes that of both images. Its size and
     shape come from a jackknife over small cells (`_jackknife`), the correlation of errors between
@@ -107,16 +107,13 @@ def pose_covariance(residuals: Residuals, loss: Loss, places: Array, t: Array,
     J = residuals.jacobian
     squared = residuals.r**2
     _, weights = loss(squared)
+    curved = curvature_at(residuals, loss) if curved is None else curved
+    if curved is None:
+        return UNDETERMINED
     H = (J * weights) @ J.T
-    if not np.isfinite(H).all():
-        return UNDETERMINED
-    eigenvalues = np.linalg.eigvalsh(H)
-    if eigenvalues[0] <= 1e-12 * eigenvalues[-1]:
-        return UNDETERMINED
-    curved = _curvature_at(residuals, loss, H, hessian)
     cells, pulls, products = _summed_by_cell(H, places, J, weights, residuals.r)
     large = cells.in_larger(max(np.sqrt(np.ptp(places, axis=0).prod() / LARGE_CELLS), CELL))
-    if curved is None or not (cells.determine_pose() and large.determine_pose()):
+    if not (cells.determine_pose() and large.determine_pose()):
         return UNDETERMINED
     shifts, inverses_left = leave_one_out(H, cells.sums)
     size = cells.size(shifts)
@@ -161,7 +158,7 @@ def loss_hessian(problem: JetProblem, pose: Pose, residuals: Residuals, loss: Lo
 
 
 def widened_by_profile(covariance: Array, problem: JetProblem, pose: Pose, loss: Loss,
-                       residuals: Residuals | None = None, hessian: Array | None = None) -> Array:
+                       residuals: Residuals, curved: Array) -> Array:
     """
     Widen a covariance (5, 5) where the loss rises less than its curvature at the minimum predicts.
 
@@ -170,14 +167,10 @@ def widened_by_profile(covariance: Array, problem: JetProblem, pose: Pose, loss:
     So the loss is evaluated where each axis of the ellipsoid meets the 95 % bound, on both sides:
     if it has risen by a share of what a parabola would have on either side, the standard deviation
     is divided by that share. (Profile likelihoods, as in Bates and Watts, Nonlinear Regression
-    Analysis, chapter 6.) residuals: those at the pose, if known; hessian: as for
-    `pose_covariance`.
+    Analysis, chapter 6.) residuals: those at the pose; curved: (5, 5), see `curvature_at`.
     """
-    residuals = residuals or epipolar_residuals(problem, pose.R, pose.t)
-    J = residuals.jacobian
-    curved = _curvature_at(residuals, loss, (J * loss(residuals.r**2)[1]) @ J.T, hessian)
     variances, axes = np.linalg.eigh(covariance)
-    if curved is None or variances[0] <= 0:
+    if variances[0] <= 0:
         return covariance
     ends = (axes * np.sqrt(_CHI2_95 * variances)).T
     displaced = map(Pose, *moved_all(pose.R, pose.t, residuals.tangents,
@@ -209,17 +202,23 @@ def calibration_covariance(problem: JetProblem, K: Array, pose: Pose, residuals:
     return np.asarray(lifted @ lifted.T)
 
 
-def _curvature_at(residuals: Residuals, loss: Loss, H: Array, hessian: Array | None
-                  ) -> Array | None:
+def curvature_at(residuals: Residuals, loss: Loss, hessian: Array | None = None) -> Array | None:
     """
-    Return the curvature (5, 5) of a loss at a pose, None if it is not positive by the inliers.
+    Return the curvature (5, 5) of a loss at a pose, None if the matches do not determine that.
 
-    H: (5, 5) weighted; hessian: (5, 5) with the second derivatives of the residuals, if known.
-    They do not make a minimum of what is none by the inliers. And of a pose that was not optimised
-    they may leave none, where the inliers have one nearby.
+    Or if it is not positive by the inliers. hessian: (5, 5) as of `loss_hessian`, without the
+    second derivatives of the residuals if None. They do not make a minimum of what is none by the
+    inliers. And of a pose that was not optimised they may leave none, where the inliers have one
+    nearby.
     """
-    J = residuals.jacobian
-    curved = _loss_curvature(H, (J * loss.curvature(residuals.r**2)) @ J.T)
+    J, squared = residuals.jacobian, residuals.r**2
+    H = (J * loss(squared)[1]) @ J.T
+    if not np.isfinite(H).all():
+        return None
+    eigenvalues = np.linalg.eigvalsh(H)
+    if eigenvalues[0] <= 1e-12 * eigenvalues[-1]:
+        return None
+    curved = _loss_curvature(H, (J * loss.curvature(squared)) @ J.T)
     if curved is None or hessian is None:
         return curved
     with_second = _loss_curvature(H, hessian)

@@ -15,7 +15,6 @@ from djet_ros.core.correction import AS_CALIBRATED, Correction, OF_CAMERA
 from djet_ros.core.geometry import rays
 from djet_ros.core.types import Array
 import numpy as np
-from scipy.special import logsumexp
 
 # chosen: prior standard deviation of the distortion, as displacement of the farthest corner
 # relative to its distance from the principal point; and those of the focal length and of the
@@ -95,13 +94,14 @@ class SelfCalibration:
         The odds that some are right grow by the ratio of posterior to prior density where they are
         zero (Dickey, Annals of Mathematical Statistics 1971).
         """
-        mean, covariance = self.mean[:OF_CAMERA], self._of_fields
-        logs = []
-        for right in _SUBSETS:
-            block = covariance[np.ix_(right, right)]
-            logs.append(right.sum() * np.log(_PRIOR_ODDS) - np.linalg.slogdet(block)[1] / 2
-                        - mean[right] @ np.linalg.solve(block, mean[right]) / 2)
-        return float(np.exp(logs[-1] - logsumexp(logs)))
+        mean = np.where(_SUBSETS, self.mean[:OF_CAMERA], 0.0)
+        blocks = np.where(_SUBSETS[:, :, None] & _SUBSETS[:, None], self._of_fields,
+                          np.eye(OF_CAMERA))
+        squared = (mean * np.linalg.solve(blocks, mean[:, :, None])[:, :, 0]).sum(1)
+        logs = (_SUBSETS.sum(1) * np.log(_PRIOR_ODDS)
+                - (np.linalg.slogdet(blocks)[1] + squared) / 2)
+        odds = np.exp(logs - logs.max())
+        return float(odds[-1] / odds.sum())
 
     @property
     def significant(self) -> bool:

@@ -9,6 +9,7 @@ from djet_ros.core.algorithm import ALGORITHM_TUNING, Track
 from djet_ros.core.correction import turn_of_deviating_camera
 from djet_ros.core.covariance import (
     calibration_covariance,
+    curvature_at,
     is_within,
     lifted_covariance,
     loss_hessian,
@@ -259,10 +260,11 @@ def _covariance(track: Track, pose: Pose, x: Array, flipped: bool, near_noise: b
     voting, problem, loss = x.compress(track.voting, axis=0), track.problem, track.loss
     residuals = epipolar_residuals(problem, pose.R, pose.t) if flipped else track.residuals
     hessian = loss_hessian(problem, pose, residuals, loss) if near_noise else None
-    covariance, _ = pose_covariance(residuals, loss, voting, pose.t, False, hessian)
-    if not np.isfinite(covariance).all():
+    curved = curvature_at(residuals, loss, hessian)
+    covariance, _ = pose_covariance(residuals, loss, voting, pose.t, False, curved)
+    if curved is None or not np.isfinite(covariance).all():
         return covariance
-    return widened_by_profile(covariance, problem, pose, loss, residuals, hessian)
+    return widened_by_profile(covariance, problem, pose, loss, residuals, curved)
 
 
 def _compare_with_rivals(pose: Pose, covariance: Array, track: Track, x: Array,
