@@ -37,7 +37,7 @@ from djet_ros.lab.summary import table_rows
 from djet_ros.lab.tables import results_table
 from djet_ros.odometry.camera import Camera
 from djet_ros.recordings.bag_writers import write_kitti_bag
-from djet_ros.recordings.frame_sequence import FrameSequence, ImageFiles
+from djet_ros.recordings.frame_sequence import FrameSequence, ImageFiles, Intrinsics
 from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.trajectories import read_tum
 from djet_ros.replay.drift import drift
@@ -302,8 +302,8 @@ def torn_truth(road: Path, folder: Path) -> Path:
 def test_no_method_has_features_where_the_lens_shows_nothing(road, tmp_path):
     """Neither in files nor in what is taken out of a bag."""
     D, rendered = [0.3, 0.1, 0.0, 0.0, 0.0], KittiSequence(road, end=3)
-    files = FrameSequence('lens', ImageFiles(rendered.frame_paths), rendered.K,
-                          rendered.stamps_ns, None, D)
+    files = FrameSequence('lens', ImageFiles(rendered.frame_paths), Intrinsics(rendered.K, D),
+                          rendered.stamps_ns, None)
     write_kitti_bag(files, tmp_path / 'bag')
     bag = readable_frames(tmp_path / 'bag', tmp_path)
     unseen = Camera(files.K, np.array(D), files.size).unseen(files.size[::-1])

@@ -78,24 +78,38 @@ def number_rows(path: Path, columns: int) -> Array:
     """Return the numbers (N, columns) of a text file, a row per line; raise DjetError."""
     table = array('d')
     for number, text in lines(path):
-        try:
-            row = numbers(text)
-        except ValueError as error:
-            raise DjetError(f'{path} line {number}: {error}; correct or replace it') from error
-        if len(row) != columns:
-            raise DjetError(f'{path} line {number} has {len(row)} numbers; it must have '
-                            f'{columns}')
-        table.extend(row)
+        table.extend(numbers_of(f'{path} line {number}', text, columns))
     return np.array(table, dtype=np.float64).reshape(-1, columns)
+
+
+def numbers_of(place: str, text: str, count: int) -> list[float]:
+    """Return so many numbers of a text; raise DjetError, beginning with its place, if wrong."""
+    try:
+        values = numbers(text)
+    except ValueError as error:
+        raise DjetError(f'{place}: {error}; correct or replace it') from error
+    if len(values) != count:
+        raise DjetError(f'{place} has {len(values)} numbers; it must have {count}')
+    return values
 
 
 def stamped_rows(path: Path, columns: int, stamp: Callable[[str], int]
                  ) -> tuple[NDArray[np.int64], Array]:
     """Return stamps (N,) in ns, exact, of the first column, and the others (N, columns - 1)."""
     rows = number_rows(path, columns)
-    stamps = [stamped(path, number, text.replace(',', ' ').split()[0], stamp)
-              for number, text in lines(path)]
-    return np.array(stamps, dtype=np.int64), rows[:, 1:]
+    return read_stamps(path, lambda text: stamp(text.replace(',', ' ').split()[0])), rows[:, 1:]
+
+
+def image_stamps(path: Path, stamp: Callable[[str], int], images: int) -> NDArray[np.int64]:
+    """Return the increasing stamps (N,) in ns of a file with a line per image, or DjetError."""
+    stamps = read_stamps(path, stamp)
+    check_count(path, len(stamps), images)
+    return increasing(stamps, path)
+
+
+def read_stamps(path: Path, stamp: Callable[[str], int]) -> NDArray[np.int64]:
+    """Return the stamps (N,) in ns of all lines; raise DjetError for the first that has none."""
+    return np.array([stamped(path, number, text, stamp) for number, text in lines(path)], np.int64)
 
 
 def stamped(path: Path, number: int, text: str, stamp: Callable[[str], int]) -> int:
@@ -112,6 +126,13 @@ def check_positions(positions: Array, path: Path) -> None:
     if wrong.size:
         raise DjetError(f'{path}: pose {wrong[0]} is at {positions[wrong[0]].tolist()} m, farther '
                         f'than {FARTHEST:g} m; is it a file of poses?')
+
+
+def check_count(path: Path, have: int, images: int) -> None:
+    """Raise DjetError if a file has not one line per image."""
+    if have != images:
+        raise DjetError(f'{path} has {have} lines for {images} images; it must have one per '
+                        'image')
 
 
 def increasing(stamps_ns: NDArray[np.int64], path: Path) -> NDArray[np.int64]:
