@@ -27,6 +27,7 @@ from djet_ros.recordings.imu import ImuTrack, read_asl_imu
 from djet_ros.recordings.kitti import check_rigid, KittiSequence, STAMP_OFFSET_NS
 from djet_ros.recordings.kitti_raw import is_kitti_raw, kitti_raw
 from djet_ros.recordings.text import (
+    by_numbers,
     image_stamps,
     increasing,
     lines,
@@ -108,7 +109,7 @@ def plain_images(folder: Path) -> FrameSequence:
     added if they begin before it: a clock that ROS can use is kept. Without times.txt the images
     are taken to be at 30 Hz.
     """
-    paths = sorted(_images_in(folder), key=_by_numbers)
+    paths = sorted(_images_in(folder), key=by_numbers)
     images = ImageFiles(paths)
     camera, times = camera_beside(folder, images.size), folder / 'times.txt'
     stamps = (image_stamps(times, nanoseconds, len(paths)) if times.exists()
@@ -186,12 +187,6 @@ def _images_in(folder: Path) -> Iterable[Path]:
     """Return the image files in a folder, hidden ones excepted."""
     return (path for path in folder.glob('*')
             if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith('.'))
-
-
-def _by_numbers(path: Path) -> list[tuple[int, str]]:
-    """Return a key by which 10.png comes after 9.png."""
-    return [(int(part), '') if part.isdecimal() else (0, part)
-            for part in re.split('([0-9]+)', path.name)]
 
 
 def _usual_stamps(count: int) -> NDArray[np.int64]:

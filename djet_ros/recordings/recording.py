@@ -37,7 +37,6 @@ RAW_IMAGE_TOPIC = '/camera/image_raw'
 INFO_TOPIC = '/camera/camera_info'
 GROUND_TRUTH_TOPIC = '/ground_truth/pose'
 IMU_TOPIC = '/imu/data_raw'
-STATIC_FRAMES_TOPIC = '/tf_static'
 CAMERA_FRAME = 'camera'
 IMU_FRAME = 'imu'
 WORLD_FRAME = 'camera_first'
@@ -132,7 +131,7 @@ class SequenceRecording(Recording):
         known = self._poses is not None or self._stamped is not None
         self.ground_truth_topic = GROUND_TRUTH_TOPIC if known else None
         self.auxiliary = {} if self._imu is None else {'imu': IMU_TOPIC,
-                                                       'frames': STATIC_FRAMES_TOPIC}
+                                                       'frames': static_frames.TOPIC}
 
     def __len__(self) -> int:
         """Count the images."""
@@ -268,8 +267,8 @@ class BagRecording(Recording):
                 yield what, chosen[0]
             elif strict:
                 raise DjetError(f'{self.bag.path} has {_why_not_one(what, name, have)}')
-        if wanted and any(topic.name == STATIC_FRAMES_TOPIC for topic in self._topics):
-            yield 'frames', STATIC_FRAMES_TOPIC
+        if wanted and any(topic.name == static_frames.TOPIC for topic in self._topics):
+            yield 'frames', static_frames.TOPIC
 
     def _require_one_type(self) -> None:
         """Raise DjetError if a chosen topic was recorded with several types."""
@@ -395,7 +394,7 @@ def _imu_frame(stamp: int, imu: ImuTrack) -> BagMessage:
     """Return the static transform of the IMU, with its rotation only: rates need no position."""
     pose = np.eye(4)
     pose[:3, :3] = imu.to_camera
-    return BagMessage(STATIC_FRAMES_TOPIC, stamp,
+    return BagMessage(static_frames.TOPIC, stamp,
                       MAKE.frame(stamp, CAMERA_FRAME, IMU_FRAME, pose))
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from decimal import Decimal, InvalidOperation
 import math
 from pathlib import Path
+import re
 
 from djet_ros.config.safe_files import read_text
 from djet_ros.core.types import Array
@@ -58,6 +59,12 @@ def lines(path: Path) -> Iterator[tuple[int, str]]:
     for number, line in enumerate(read_text(path).splitlines(), 1):
         if (text := line.strip()) and not text.startswith('#'):
             yield number, text
+
+
+def by_numbers(path: Path) -> list[tuple[int, str]]:
+    """Return a key by which 10.png comes after 9.png."""
+    return [(int(part), '') if part.isdecimal() else (0, part)
+            for part in re.split('([0-9]+)', path.name)]
 
 
 def numbers(text: str) -> list[float]:
