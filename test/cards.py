@@ -1,5 +1,8 @@
 """A small world of textured cards at several depths: exact views of it, made in milliseconds."""
 
+import os
+from pathlib import Path
+
 import cv2
 from djet_ros.odometry.frame import Frame
 import numpy as np
@@ -44,6 +47,22 @@ class Cards:
     def frame(self, seconds: float, pose: np.ndarray = REST, **more) -> Frame:
         """Render the cards as a frame."""
         return Frame(self.gray(pose, **more), K, round(seconds * 1e9), 'camera')
+
+
+def filmed(folder: Path, step: np.ndarray, frames: int, different: int = 6) -> Path:
+    """Write a drive to and fro as a KITTI sequence; all but a few images are links."""
+    images, cards, here = folder / 'image_0', Cards(), np.eye(4)
+    images.mkdir(parents=True)
+    for i in range(min(frames, different)):
+        cv2.imwrite(str(images / f'{i:06d}.png'), cards.gray(here))
+        here = here @ step
+    for i in range(different, frames):
+        back = different - 1 - abs(different - 1 - i % (2 * different - 2))
+        os.link(images / f'{back:06d}.png', images / f'{i:06d}.png')
+    row = ' '.join(str(v) for v in np.hstack([K, np.zeros((3, 1))]).ravel())
+    (folder / 'calib.txt').write_text(f'P0: {row}\n')
+    (folder / 'times.txt').write_text(''.join(f'{0.1 * i:.6e}\n' for i in range(frames)))
+    return folder
 
 
 def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> np.ndarray:

@@ -11,8 +11,8 @@ import subprocess
 import sys
 import time
 
-from cards import Cards, DEPTHS, K, pose, SIZE
-from commands import checked as djet
+from cards import Cards, DEPTHS, filmed, K, pose, SIZE
+from commands import alone, checked as djet, contents, DJET
 import cv2
 from djet_ros.config.flat import from_flat
 from djet_ros.config.sections import Config
@@ -20,7 +20,6 @@ from djet_ros.config.yaml_files import load_yaml
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Status
 from djet_ros.errors import DjetError
-from djet_ros.lab.scenes.sequence import render_sequence
 from djet_ros.odometry.camera import Camera
 from djet_ros.odometry.messages import OPTICAL_TO_BODY, pose_of
 from djet_ros.posegraph import recorded_frames
@@ -44,35 +43,19 @@ import pytest
 from ros_messages import camera_info, header, image, message_type, STORE
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-DJET = [sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; sys.exit(main())']
 FRAMES = 6
 STEP = pose(x=0.25, z=0.15, yaw=0.01)
 SECOND = 10**9
-
-
-def djet_alone(*call, **settings):
-    """Run the command in a process of its own, with these variables of the environment."""
-    return subprocess.run([*DJET, *map(str, call)], capture_output=True, text=True, timeout=120,
-                          check=False, env={**os.environ, **settings})
 
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
     """Write a small KITTI sequence with ground truth, and return its folder."""
     root = tmp_path_factory.mktemp('dataset')
-    sequence = root / 'sequences' / '00'
-    (sequence / 'image_0').mkdir(parents=True)
     (root / 'poses').mkdir()
-    cards, here, rows = Cards(), np.eye(4), []
-    for i in range(FRAMES):
-        cv2.imwrite(str(sequence / 'image_0' / f'{i:06d}.png'), cards.gray(here))
-        rows.append(' '.join(repr(float(v)) for v in here[:3].ravel()))
-        here = here @ STEP
-    row = ' '.join(str(v) for v in np.hstack([K, np.zeros((3, 1))]).ravel())
-    (sequence / 'calib.txt').write_text(f'P0: {row}\n')
-    (sequence / 'times.txt').write_text(''.join(f'{0.1 * i:.6e}\n' for i in range(FRAMES)))
-    (root / 'poses' / '00.txt').write_text('\n'.join(rows) + '\n')
-    return sequence
+    np.savetxt(root / 'poses' / '00.txt', [
+        np.linalg.matrix_power(STEP, i)[:3].ravel() for i in range(FRAMES)])
+    return filmed(root / 'sequences' / '00', STEP, FRAMES)
 
 
 @pytest.fixture(scope='module')
@@ -226,14 +209,24 @@ def test_missing_mounting_in_a_recording_is_one_line(tmp_path, folder):
         assert not (tmp_path / f'of_{source.name}').exists()
 
 
-def test_sequence_with_an_imu_gives_the_odometry_of_the_imu(tmp_path):
-    folder = render_sequence('road', tmp_path, 4, size=(480, 160))
-    call = ('replay', folder, '--output', tmp_path / 'out', '--base-frame', 'imu')
+def with_imu(folder, tmp_path):
+    """Copy the sequence, and add a gyro at 100 Hz that turns as the camera does."""
+    copy = Path(shutil.copytree(folder, tmp_path / '01'))
+    with (copy / 'calib.txt').open('a') as calibration:
+        calibration.write('Tr_imu_to_cam: 1 0 0 0 0 1 0 0 0 0 1 0\n')
+    (copy / 'imu.csv').write_text(''.join(
+        f'{i * SECOND // 100},0,0.1,0,0,-9.8,0\n' for i in range(10 * FRAMES)))
+    return copy
+
+
+def test_sequence_with_an_imu_gives_the_odometry_of_the_imu(folder, tmp_path):
+    call = ('replay', with_imu(folder, tmp_path), '--output', tmp_path / 'out', '--base-frame',
+            'imu')
     assert "has no transform from it to 'camera'" in djet(*call, expect=2).stderr
     djet(*call, '--imu', 'true')
     with Bag(tmp_path / 'out' / 'bag') as result:
         published = [one.message for one in result.messages({'/vo_node/odometry'})]
-    assert [message.child_frame_id for message in published] == ['imu'] * 4
+    assert [message.child_frame_id for message in published] == ['imu'] * FRAMES
 
 
 def test_missing_mounting_keeps_earlier_results(tmp_path):
@@ -528,11 +521,10 @@ def test_only_results_are_overwritten_and_only_on_request(bag, replayed, tmp_pat
 def test_a_folder_to_which_another_replay_still_writes_is_refused(tmp_path):
     results = tmp_path / 'results'
     with ResultsFolder(results, Config()):
-        before = {path: path.read_bytes() for path in results.rglob('*') if path.is_file()}
+        before = contents(results)
         with pytest.raises(DjetError, match='written to by another replay, which still runs'):
             ResultsFolder(results, from_flat({'preset': 'fast'}), overwrite=True)
-        assert before == {
-            path: path.read_bytes() for path in results.rglob('*') if path.is_file()}
+        assert contents(results) == before
     with ResultsFolder(results, from_flat({'preset': 'fast'}), overwrite=True):
         assert load_yaml(results / 'config.yaml').preset == 'fast'
 
@@ -543,24 +535,24 @@ def test_a_folder_to_which_another_replay_still_writes_is_refused(tmp_path):
 def test_a_mistake_in_the_command_costs_no_earlier_results(mistake, bag, replayed, tmp_path):
     results = tmp_path / 'results'
     shutil.copytree(replayed[0], results)
-    before = {path: path.read_bytes() for path in results.rglob('*') if path.is_file()}
+    before = contents(results)
     source, *call = mistake
     printed = djet('replay', bag if source == 'bag' else tmp_path / source, *call, '--output',
                    results, '--overwrite', expect=2).stderr
     assert printed.count('\n') == 1
-    assert {path: path.read_bytes() for path in results.rglob('*') if path.is_file()} == before
+    assert contents(results) == before
 
 
 def test_images_of_which_none_can_be_used_cost_no_earlier_results(folder, replayed, tmp_path):
     results = tmp_path / 'results'
     shutil.copytree(replayed[0], results)
-    before = {path: path.read_bytes() for path in results.rglob('*') if path.is_file()}
+    before = contents(results)
     shutil.copytree(folder, tmp_path / '00')
     for path in (tmp_path / '00' / 'image_0').iterdir():
         path.write_bytes(path.read_bytes()[:500])
     printed = djet('replay', tmp_path / '00', '--output', results, '--overwrite', expect=2).stderr
     assert f'none of {FRAMES} images could be used' in printed
-    assert {path: path.read_bytes() for path in results.rglob('*') if path.is_file()} == before
+    assert contents(results) == before
     djet('replay', folder, '--output', results, '--overwrite', '--preset', 'paper')
     assert summary(results)['preset'] == 'paper'
     assert not list(results.glob('.*'))
@@ -568,8 +560,8 @@ def test_images_of_which_none_can_be_used_cost_no_earlier_results(folder, replay
 
 @pytest.mark.slow
 def test_results_are_utf_8_whatever_the_locale_is(bag, tmp_path):
-    done = djet_alone('replay', bag, '--output', tmp_path / 'out', LC_ALL='C', PYTHONUTF8='0',
-                      PYTHONCOERCECLOCALE='0')
+    done = alone('replay', bag, '--output', tmp_path / 'out', LC_ALL='C', PYTHONUTF8='0',
+                 PYTHONCOERCECLOCALE='0')
     assert (done.returncode, done.stderr) == (0, '')
     assert 'rad/s²' in (tmp_path / 'out' / 'config.yaml').read_text('utf-8')
     assert load_yaml(tmp_path / 'out' / 'config.yaml') == Config()
@@ -649,7 +641,8 @@ def bad_config(tmp_path, bag):
     (lambda t, b: [b, '--scale', 'speed'], 'speed'),
     (lambda t, b: [b, '--scale', 'camera_height'], 'give the metres from the ground'),
     (lambda t, b: [b, '--scale', 'constant'], 'scale_value is 0; give the metres of each'),
-    (lambda t, b: [b, '--image-topic', '/other'], "'/other'"),
+    (lambda t, b: [b, '--image-topic', '/other'], "no image topic '/other'"),
+    (lambda t, b: [b, '--info-topic', '/other'], "no CameraInfo topic '/other'"),
     (lambda t, b: [b, '--imu', 'true', '--imu-topic', '/other'], "no topic '/other' for 'imu'"),
     *[(lambda t, b, what=what: [b, f'--{what}-topic', '/some'],
        f"--{what}-topic is '/some', but the configuration does not use it; set odometry.")
@@ -775,13 +768,8 @@ def test_images_beyond_max_gap_give_a_warning(tmp_path, bag):
 
 
 def test_12_bit_camera_gives_a_warning_that_gray_range_resolves(tmp_path):
-    cards = Cards()
-    frames = [cards.gray(np.linalg.matrix_power(STEP, i)).astype('<u2') * 4 for i in range(FRAMES)]
-    source = record(tmp_path / 'bag', [
-        (topic, message, SECOND + i * SECOND // 10) for i, values in enumerate(frames)
-        for topic, message in [
-            (INFO_TOPIC, camera_info(K, SIZE, SECOND + i * SECOND // 10)),
-            (IMAGE_TOPIC, image(values, 'mono16', SECOND + i * SECOND // 10))]])
+    source = record(tmp_path / 'bag', drive(lambda i, message: image(
+        message.data.reshape(SIZE[::-1]).astype('<u2') * 4, 'mono16', SECOND + i * SECOND // 10)))
     done = djet('replay', source, '--output', tmp_path / 'dark')
     assert 'djet: warning: few gray levels: ' in done.stderr
     done = djet('replay', source, '--gray-range', '0 1023', '--output', tmp_path / 'stretched')
@@ -990,14 +978,9 @@ def test_constant_stamps_give_a_warning(goes_on, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize('sign, code', [
-    (signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGKILL, -9)])
-def test_interrupted_run_is_readable_and_marked_incomplete(folder, tmp_path, sign, code):
-    endless = tmp_path / 'sequences' / '01'
-    shutil.copytree(folder, endless)
-    for i in range(FRAMES, 2000):
-        os.symlink(endless / 'image_0' / f'{i % FRAMES:06d}.png',
-                   endless / 'image_0' / f'{i:06d}.png')
-    (endless / 'times.txt').write_text(''.join(f'{0.1 * i:.6e}\n' for i in range(2000)))
+    (signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_interrupted_run_is_readable_and_marked_incomplete(tmp_path, sign, code):
+    endless = filmed(tmp_path / 'sequences' / '01', STEP, 2000)
     results = tmp_path / 'results'
     process = subprocess.Popen([*DJET, 'replay', endless, '--output', results],
                                stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
@@ -1012,16 +995,11 @@ def test_interrupted_run_is_readable_and_marked_incomplete(folder, tmp_path, sig
     found = summary(results)
     assert found['complete'] is False
     assert (found['source'], found['image_topic']) == (str(endless), IMAGE_TOPIC)
-    assert ('images' in found) == (results / 'bag' / 'metadata.yaml').exists() == (code > 0)
-    poses = [line for line in trajectory.read_text().splitlines() if len(line.split()) == 8]
-    assert len(poses) > 5
-    found = []
+    assert 'images' in found
+    assert len(trajectory.read_text().splitlines()) > 5
+    assert (results / 'bag' / 'metadata.yaml').exists()
     with Bag(results / 'bag') as out:
-        try:
-            found += out.messages({'/vo_node/odometry'})
-        except DjetError:
-            assert code == -9
-    assert sign == signal.SIGKILL or len(found) >= 5
+        assert len(list(out.messages({'/vo_node/odometry'}))) > 5
 
 
 @pytest.mark.slow
@@ -1030,18 +1008,22 @@ def test_a_signal_within_a_write_waits_until_the_frame_is_in_all_results(folder,
     within = """
 import signal, sys
 from djet_ros.cli.main import main
-left, records = int(sys.argv.pop(1)), 0
+from rosbags.rosbag2 import Writer
+left, records, write = int(sys.argv.pop(1)), 0, Writer.write
+def counted(*arguments):
+    global records
+    records += 1
+    if records == 9:
+        sys.setprofile(watch)
+    write(*arguments)
 def watch(frame, event, _):
-    global left, records
-    if event != 'call' or 'rosbags' not in frame.f_code.co_filename:
-        return
-    records += frame.f_code.co_name == 'write' and frame.f_code.co_filename.endswith('/writer.py')
-    if records > 8:
+    global left
+    if event == 'call' and 'rosbags' in frame.f_code.co_filename:
         left -= 1
         if not left:
             sys.setprofile(None)
             signal.raise_signal(signal.SIGTERM)
-sys.setprofile(watch)
+Writer.write = counted
 sys.exit(main())
 """
     for place in range(1, 11, 3):
@@ -1103,8 +1085,8 @@ def test_several_ground_truths_are_named_with_a_remedy(bag, tmp_path):
             'camera as a file (--poses)\n')
     done = djet('replay', twice, '--output', tmp_path / 'out')
     assert done.stderr == f'djet: warning: no errors were computed: {both}'
-    answer = djet_alone('replay', twice, '--output', tmp_path / 'no', '--scale', 'ground_truth')
-    assert answer.returncode == 2
+    answer = djet('replay', twice, '--output', tmp_path / 'no', '--scale', 'ground_truth',
+                  expect=2)
     assert answer.stderr.endswith(f"odometry.scale is 'ground_truth', but {both}")
 
 
@@ -1275,18 +1257,10 @@ def test_real_frames_are_replayed_within_a_degree(kitti, tmp_path):
     assert found['translation_error_deg']['max'] < 2
 
 
-def test_documented_command_is_valid():
-    parsed = djet('replay', '--help').stdout
-    for flag in ('--output', '--method', '--preset', '--overwrite', '--config', '--image-topic',
-                 '--info-topic', '--poses', '--scale'):
-        assert flag in parsed
-
-
-@pytest.mark.slow
-def test_unused_auxiliary_inputs_give_a_warning(tmp_path):
-    folder = render_sequence('road', tmp_path, 8, size=(480, 160))
+def test_unused_auxiliary_inputs_give_a_warning(folder, tmp_path):
+    source = with_imu(folder, tmp_path)
     for enough in (False, True):
         if enough:
-            (folder / 'imu.csv').write_text('')
-        run = djet('replay', folder, '--imu', 'true', '--overwrite', '--output', tmp_path / 'out')
+            (source / 'imu.csv').write_text('')
+        run = djet('replay', source, '--imu', 'true', '--overwrite', '--output', tmp_path / 'out')
         assert ('djet: warning: no imu in time: ' in run.stderr) is enough
