@@ -139,14 +139,11 @@ def asl_mounting(path: Path) -> Array:
 def _asl_sensor(path: Path) -> tuple[dict[str, Any], Array]:
     """Return a sensor.yaml, and the pose (4, 4) of the sensor in the body."""
     sensor = read_yaml(path)
-    if not isinstance(sensor, dict):
-        raise DjetError(f'{path} is no ASL sensor description: it has no T_BS; replace the file, '
-                        'which may be truncated')
     try:
         sensor_in_body = _rigid(sensor['T_BS']['data'])
     except _UNFIT as error:
-        raise DjetError(f'{path} is no ASL sensor description (T_BS): '
-                        f'{one_line(error)}') from error
+        raise DjetError(f'{path} is no ASL sensor description: it has no T_BS of 16 numbers; '
+                        'replace the file, which may be truncated') from error
     check_rigid(sensor_in_body[None], path)
     return sensor, sensor_in_body
 

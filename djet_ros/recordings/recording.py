@@ -144,16 +144,18 @@ class SequenceRecording(Recording):
         The image comes last, after everything up to its stamp and the first IMU sample not before
         it, so that a consumer can process it at once.
         """
-        sequence, next_sample = self._sequence, 0
+        sequence = self._sequence
+        samples: Iterator[BagMessage] = iter(())
         yield from _stamped_poses(self._stamped)
+        if self._imu is not None and (
+                topics is None or not set(topics).isdisjoint(self.auxiliary.values())):
+            yield _imu_frame(int(sequence.stamps_ns[0]), self._imu)
+            samples = _imu_messages(self._imu)
         for index, stamp in enumerate(sequence.stamps_ns.tolist()):
-            if self._imu is not None and (
-                    topics is None or not set(topics).isdisjoint(self.auxiliary.values())):
-                if index == 0:
-                    yield _imu_frame(stamp, self._imu)
-                for sample in self._imu.until(next_sample, stamp):
-                    yield _imu_message(self._imu, sample)
-                    next_sample = sample + 1
+            for sample in samples:
+                yield sample
+                if sample.stamp_ns >= stamp:
+                    break
             if self._poses is not None and np.isfinite(self._poses[index]).all():
                 yield _ground_truth(stamp, self._poses[index])
             if topics is None or self.image_topic in topics:
@@ -398,7 +400,6 @@ def _imu_frame(stamp: int, imu: ImuTrack) -> BagMessage:
                       MAKE.frame(stamp, CAMERA_FRAME, IMU_FRAME, pose))
 
 
-def _imu_message(imu: ImuTrack, index: int) -> BagMessage:
-    stamp = int(imu.stamps_ns[index])
-    return BagMessage(IMU_TOPIC, stamp, MAKE.imu(
-        stamp, IMU_FRAME, imu.rates[index], imu.accelerations[index]))
+def _imu_messages(imu: ImuTrack) -> Iterator[BagMessage]:
+    for stamp, rates, accelerations in zip(imu.stamps_ns.tolist(), imu.rates, imu.accelerations):
+        yield BagMessage(IMU_TOPIC, stamp, MAKE.imu(stamp, IMU_FRAME, rates, accelerations))

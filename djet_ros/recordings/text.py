@@ -32,7 +32,7 @@ class LineFile:
         """Create the file, which must not exist."""
         self._file = path.open('xb', buffering=0)
 
-    def write(self, line: str) -> int:
+    def write(self, line: str) -> None:
         """Append a line, which includes its line end."""
         begin = self._file.tell()
         rest = line.encode()
@@ -43,7 +43,6 @@ class LineFile:
             self._file.truncate(begin)
             self._file.seek(begin)
             raise
-        return len(line)
 
     def fileno(self) -> int:
         """Return its descriptor."""
