@@ -27,10 +27,11 @@ from djet_ros.recordings.storages.base import BrokenFile, Connection, LARGEST_PI
 from djet_ros.recordings.storages.compression import zstd
 import numpy as np
 import pytest
+from ros_messages import record
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability
 from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer as Ros2Writer
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 K = np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
@@ -55,21 +56,6 @@ def info(stamp):
 
 def pose(stamp):
     return MAKE.pose_in(stamp, 'camera', np.eye(4))
-
-
-def record(path, messages, storage='mcap', mode=CompressionMode.NONE, store=None):
-    """Write (topic, message, stamp) with rosbags; mode FILE, MESSAGE or STORAGE compresses."""
-    store = store or jazzy()
-    writer = Ros2Writer(path, version=9, storage_plugin=STORAGES[storage])
-    writer.set_compression(mode, CompressionFormat.ZSTD)
-    connections = {}
-    with writer:
-        for topic, message, stamp in messages:
-            kind = message.__msgtype__
-            if (topic, kind) not in connections:
-                connections[topic, kind] = writer.add_connection(topic, kind, typestore=store)
-            writer.write(connections[topic, kind], stamp, store.serialize_cdr(message, kind))
-    return path
 
 
 def camera_messages(count=30):

@@ -40,8 +40,7 @@ from djet_ros.replay.pair_errors import pair_errors, statistics
 from djet_ros.replay.results import ResultsFolder
 import numpy as np
 import pytest
-from ros_messages import camera_info, header, image, message_type, STORE
-from rosbags.rosbag2 import StoragePlugin, Writer
+from ros_messages import camera_info, header, image, message_type, record
 
 FRAMES = 6
 STEP = pose(x=0.25, z=0.15, yaw=0.01)
@@ -62,18 +61,6 @@ def folder(tmp_path_factory):
 def bag(folder, tmp_path_factory):
     path = tmp_path_factory.mktemp('bags') / 'bag'
     write_kitti_bag(KittiSequence(folder), path)
-    return path
-
-
-def record(path, messages):
-    """Write (topic, message, stamp) as a bag."""
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connections = {}
-        for topic, message, stamp in messages:
-            kind = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
-            writer.write(connections[topic], stamp, STORE.serialize_cdr(message, kind))
     return path
 
 
