@@ -64,11 +64,24 @@ def bag(folder, tmp_path_factory):
     return path
 
 
+def stamp_at(frame):
+    """Return the stamp of a frame of the drive."""
+    return SECOND + frame * SECOND // 10
+
+
+def true_poses(path, stamp=stamp_at):
+    """Write the poses of the drive, with the stamp of each frame, as a TUM file."""
+    with TumWriter(path) as truth:
+        for i in range(FRAMES):
+            truth.write(stamp(i), np.linalg.matrix_power(STEP, i))
+    return path
+
+
 def drive(change=lambda i, message: message, info=True):
     """Yield the messages of a drive; change makes another message of an image (or None)."""
     cards, here = Cards(), np.eye(4)
     for i in range(FRAMES):
-        stamp = SECOND + i * SECOND // 10
+        stamp = stamp_at(i)
         if info:
             yield INFO_TOPIC, camera_info(K, SIZE, stamp), stamp
         message = change(i, image(cards.gray(here), stamp_ns=stamp))
@@ -96,7 +109,7 @@ def test_keyframe_images_have_the_masks_of_the_odometry(tmp_path):
                         auxiliary={'mask': None}) as recording:
         frame_at = frame_finder(recording, config)
         for i in (0, 1, 3, 5):
-            left_out = frame_at(SECOND + i * SECOND // 10).left_out
+            left_out = frame_at(stamp_at(i)).left_out
             assert left_out is None if i == 3 else left_out[0].sum() == 10 + i
 
 
@@ -687,22 +700,11 @@ def test_a_file_may_have_parameters_that_only_some_scales_use(bag, tmp_path):
     assert summary(tmp_path / 'out')['scale_kind'] == 'relative'
 
 
-def seen(tmp_path, frames):
-    """Return a recording of images (H, W) with the true poses of the drive."""
-    poses = tmp_path / 'poses.txt'
-    with TumWriter(poses) as truth:
-        for i in range(len(frames)):
-            truth.write(SECOND + i * SECOND // 10, np.linalg.matrix_power(STEP, i))
-    messages = [(topic, message, stamp) for i, gray in enumerate(frames)
-                for stamp in [SECOND + i * SECOND // 10]
-                for topic, message in [(INFO_TOPIC, camera_info(K, SIZE, stamp)),
-                                       (IMAGE_TOPIC, image(gray, stamp_ns=stamp))]]
-    return record(tmp_path / 'bag', messages), poses
-
-
 def test_recording_without_tracked_pairs_gives_a_warning(tmp_path):
-    source, poses = seen(tmp_path, [np.zeros(SIZE[::-1], np.uint8)] * FRAMES)
-    done = djet('replay', source, '--poses', poses, '--output', tmp_path / 'out')
+    source = record(tmp_path / 'bag', drive(
+        lambda i, message: image(np.zeros(SIZE[::-1], np.uint8), stamp_ns=stamp_at(i))))
+    done = djet('replay', source, '--poses', true_poses(tmp_path / 'poses.txt'), '--output',
+                tmp_path / 'out')
     assert (f'djet: warning: none of {FRAMES - 1} pairs could be tracked (mostly '
             'TOO_FEW_MATCHES): the images are dark') in done.stderr
     assert 'positions' not in done.stdout
@@ -714,7 +716,7 @@ def test_recording_without_tracked_pairs_gives_a_warning(tmp_path):
 
 
 def test_a_recording_of_one_image_gives_a_warning(tmp_path):
-    source, _ = seen(tmp_path, [Cards().gray(np.eye(4))])
+    source = record(tmp_path / 'bag', drive(lambda i, message: None if i else message))
     done = djet('replay', source, '--output', tmp_path / 'out')
     assert done.stderr == ('djet: warning: only one image was used, so no motion was estimated: '
                            'that takes two images\n')
@@ -722,7 +724,8 @@ def test_a_recording_of_one_image_gives_a_warning(tmp_path):
 
 @pytest.mark.slow
 def test_stationary_camera_gives_a_warning(tmp_path):
-    source, _ = seen(tmp_path, [Cards().gray(np.eye(4))] * FRAMES)
+    source = record(tmp_path / 'bag', drive(
+        lambda i, message: image(Cards().gray(), stamp_ns=stamp_at(i))))
     done = djet('replay', source, '--output', tmp_path / 'out')
     assert (f'djet: warning: all {FRAMES - 1} pairs have no parallax (NO_PARALLAX): the camera '
             'was stationary or only rotated') in done.stderr
@@ -756,7 +759,7 @@ def test_images_beyond_max_gap_give_a_warning(tmp_path, bag):
 
 def test_12_bit_camera_gives_a_warning_that_gray_range_resolves(tmp_path):
     source = record(tmp_path / 'bag', drive(lambda i, message: image(
-        message.data.reshape(SIZE[::-1]).astype('<u2') * 4, 'mono16', SECOND + i * SECOND // 10)))
+        message.data.reshape(SIZE[::-1]).astype('<u2') * 4, 'mono16', stamp_at(i))))
     done = djet('replay', source, '--output', tmp_path / 'dark')
     assert 'djet: warning: few gray levels: ' in done.stderr
     done = djet('replay', source, '--gray-range', '0 1023', '--output', tmp_path / 'stretched')
@@ -784,11 +787,10 @@ def test_truncated_bag_is_used_up_to_the_cut(bag, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize('damage, reason, frames', [
-    (lambda i, m: image(np.zeros((100, 100), np.uint8), stamp_ns=SECOND + i * SECOND // 10)
-     if i == 3 else m, 'size_mismatch', FRAMES - 1),
-    (lambda i, m: image(np.zeros((240, 320), np.uint8), height=999,
-                        stamp_ns=SECOND + i * SECOND // 10) if i in (2, 4) else m,
-     'size_mismatch|short_data', FRAMES - 2)])
+    (lambda i, m: image(np.zeros((100, 100), np.uint8), stamp_ns=stamp_at(i)) if i == 3 else m,
+     'size_mismatch', FRAMES - 1),
+    (lambda i, m: image(np.zeros((240, 320), np.uint8), height=999, stamp_ns=stamp_at(i))
+     if i in (2, 4) else m, 'size_mismatch|short_data', FRAMES - 2)])
 def test_bad_image_is_named_and_the_rest_is_tracked(
         damage, reason, frames, tmp_path):
     results = tmp_path / 'results'
@@ -860,7 +862,7 @@ def test_zero_camera_info_loses_the_images_up_to_the_next_one(at, tmp_path):
     assert sum(found['rejected_infos'].values()) == 1
     # A second pass over the recording has the cameras of the odometry.
     with open_recording(path) as recording:
-        frame = frame_finder(recording, Config())(SECOND + 5 * SECOND // 10)
+        frame = frame_finder(recording, Config())(stamp_at(5))
     assert frame.gray.shape == SIZE[::-1]
 
 
@@ -1050,10 +1052,7 @@ def test_poses_of_a_file_replace_those_of_the_bag(bag, folder, tmp_path):
     (0.95, 0.2, 'no errors were computed: no image lies between two poses of {} that are at most '
      '0.1 s apart; give ground truth with a higher rate')])
 def test_ground_truth_of_another_time_gives_a_warning(first, apart, why, tmp_path):
-    poses = tmp_path / 'poses.txt'
-    with TumWriter(poses) as truth:
-        for i in range(FRAMES):
-            truth.write(round((first + i * apart) * SECOND), np.linalg.matrix_power(STEP, i))
+    poses = true_poses(tmp_path / 'poses.txt', lambda i: round((first + i * apart) * SECOND))
     printed = djet('replay', record(tmp_path / 'bag', drive()), '--poses', poses, '--output',
                    tmp_path / 'r').stderr
     assert printed == f'djet: warning: {why.format(poses)}\n'
@@ -1087,7 +1086,7 @@ def test_a_ground_truth_that_is_not_of_the_camera_gives_a_warning(child, warned,
 
     def truth():
         for i in range(FRAMES):
-            stamp = SECOND + i * SECOND // 10
+            stamp = stamp_at(i)
             stamped = MAKE.pose_in(stamp, 'world', np.linalg.matrix_power(STEP, i))
             at = stamped.pose.position
             yield '/ground_truth/state', kinds['TransformStamped'](
@@ -1151,10 +1150,7 @@ def test_a_speed_topic_gives_metres(tmp_path):
 @pytest.mark.slow
 def test_metric_scale_without_measurements_gives_a_warning(tmp_path):
     source = record(tmp_path / 'bag', with_speeds(late=3600))
-    poses = tmp_path / 'another_day.txt'
-    with TumWriter(poses) as truth:
-        for i in range(FRAMES):
-            truth.write((5000 + i) * SECOND, np.linalg.matrix_power(STEP, i))
+    poses = true_poses(tmp_path / 'another_day.txt', lambda i: (5000 + i) * SECOND)
     for call, why in (
             (('speed',), 'the newest speed is stamped 3600.0 s after the newest image; give speeds'
              ' that are stamped by the clock of the images'),
