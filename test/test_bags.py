@@ -209,46 +209,25 @@ def test_an_existing_bag_is_replaced_only_on_demand(small_kitti, tmp_path):
         assert len(source) == 2
 
 
-def test_a_folder_that_is_no_bag_is_never_overwritten(small_kitti, tmp_path):
-    (tmp_path / 'home').mkdir()
-    (tmp_path / 'home' / 'thesis.txt').write_text('mine')
-    with pytest.raises(DjetError, match='exists and is no bag folder'):
-        write_kitti_bag(KittiSequence(small_kitti()), tmp_path / 'home', overwrite=True)
-    assert (tmp_path / 'home' / 'thesis.txt').read_text() == 'mine'
+# What a folder with a bag becomes that holds more, less or something else.
+FOREIGN = {
+    'notes beside': lambda bag: (bag / 'notes.txt').write_text('mine'),
+    'recording beside': lambda bag: shutil.copy(bag / 'out.mcap', bag / 'out_0.mcap'),
+    'folder beside': lambda bag: (bag / 'photos').mkdir(),
+    'another name': lambda bag: (bag / 'out.mcap').rename(bag / 'rosbag2_0.mcap'),
+    'link': lambda bag: (bag / 'out.mcap').symlink_to((bag / 'out.mcap').rename(
+        bag.parent / 'kept.mcap')),
+    'no metadata': lambda bag: (bag / 'metadata.yaml').unlink(),
+    'notes alone': lambda bag: [path.rename(bag / f'{path.name}.txt')
+                                for path in [*bag.iterdir()]],
+}
 
 
-def keep_notes(folder):
-    (folder / 'notes.txt').write_text('mine')
-
-
-def keep_a_recording(folder):
-    shutil.copy(folder / 'out.mcap', folder / 'out_0.mcap')
-
-
-def keep_a_folder(folder):
-    (folder / 'photos').mkdir()
-
-
-def rename_the_file(folder):
-    (folder / 'out.mcap').rename(folder / 'rosbag2_0.mcap')
-
-
-def link_to_the_file(folder):
-    (folder / 'out.mcap').rename(folder.parent / 'kept.mcap')
-    (folder / 'out.mcap').symlink_to(folder.parent / 'kept.mcap')
-
-
-def lose_the_metadata(folder):
-    (folder / 'metadata.yaml').unlink()
-
-
-@pytest.mark.parametrize('change', [keep_notes, keep_a_recording, keep_a_folder, rename_the_file,
-                                    link_to_the_file, lose_the_metadata])
-def test_a_folder_with_anything_but_an_output_bag_is_never_overwritten(
-        small_kitti, tmp_path, change):
+@pytest.mark.parametrize('what', FOREIGN)
+def test_a_folder_that_is_no_bag_is_never_overwritten(small_kitti, tmp_path, what):
     sequence = KittiSequence(small_kitti(frames=2))
     write_kitti_bag(sequence, tmp_path / 'out')
-    change(tmp_path / 'out')
+    FOREIGN[what](tmp_path / 'out')
     before = sorted((tmp_path / 'out').iterdir())
     with pytest.raises(DjetError, match='out exists and is no bag folder as this command writes'):
         write_kitti_bag(sequence, tmp_path / 'out', overwrite=True)
@@ -886,13 +865,21 @@ def test_messages_without_an_index_are_sorted_without_their_data(tmp_path):
                 if 'data' in statement and 'TEMP B-TREE' in str(plan)]
 
 
-def chunk_bomb(data, declared):
-    """Build an MCAP file of one zstd chunk that claims to unpack to some size."""
-    body = struct.pack('<QQQI', 1, 1, declared, 0)
-    body += struct.pack('<I', 4) + b'zstd' + struct.pack('<Q', len(data)) + data
-    head = struct.pack('<II', 0, 0)
-    return (b'\x89MCAP0\r\n' + struct.pack('<BQ', 1, len(head)) + head
-            + struct.pack('<BQ', 6, len(body)) + body)
+def text(value):
+    return struct.pack('<I', len(value)) + value
+
+
+def mcap_record(code, body):
+    return struct.pack('<BQ', code, len(body)) + body
+
+
+MCAP_HEAD = b'\x89MCAP0\r\n' + mcap_record(1, text(b'ros2') + text(b''))
+
+
+def chunk(data, declared):
+    """Build a zstd chunk of an MCAP file that claims to unpack to some size."""
+    return mcap_record(6, struct.pack('<QQQI', 1, 1, declared, 0) + text(b'zstd')
+                       + struct.pack('<Q', len(data)) + data)
 
 
 def test_huge_sizes_are_refused_and_not_allocated(tmp_path):
@@ -908,9 +895,8 @@ def test_huge_sizes_are_refused_and_not_allocated(tmp_path):
               'for path in sys.argv[1:]:\n'
               '    print(read_until_broken(pathlib.Path(path))[1])\n')
     message = whole_message(tmp_path, bomb)
-    for name, data in (('honest', chunk_bomb(bomb, 600 << 20)), ('liar', chunk_bomb(bomb, 1000)),
-                       ('absurd', chunk_bomb(bomb, 2**63))):
-        (tmp_path / name).write_bytes(data)
+    for name, declared in (('honest', 600 << 20), ('liar', 1000), ('absurd', 2**63)):
+        (tmp_path / name).write_bytes(MCAP_HEAD + chunk(bomb, declared))
     run = subprocess.run(
         [sys.executable, '-c', script, *(tmp_path / name for name in ('honest', 'liar', 'absurd')),
          message], stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parent, check=True,
@@ -924,20 +910,11 @@ def test_huge_sizes_are_refused_and_not_allocated(tmp_path):
 
 def mcap_of(records, times):
     """Build an MCAP file of one zstd chunk, as often as wanted."""
-    def record_of(code, body):
-        return struct.pack('<BQ', code, len(body)) + body
-
-    def text(value):
-        return struct.pack('<I', len(value)) + value
-
     schema = struct.pack('<H', 1) + text(b'sensor_msgs/msg/Image') + text(b'ros2msg') + text(b'')
     channel = struct.pack('<HH', 1, 1) + text(b'/image') + text(b'cdr') + text(b'')
-    data = record_of(3, schema) + record_of(4, channel) + records(record_of)
-    packed = zstd.compress(data)
-    chunk = record_of(6, struct.pack('<QQQI', 1, 1, len(data), 0) + text(b'zstd')
-                      + struct.pack('<Q', len(packed)) + packed)
-    return (b'\x89MCAP0\r\n' + record_of(1, text(b'ros2') + text(b'')) + chunk * times
-            + record_of(15, bytes(4)) + record_of(2, bytes(20)) + b'\x89MCAP0\r\n')
+    data = mcap_record(3, schema) + mcap_record(4, channel) + records
+    return (MCAP_HEAD + chunk(zstd.compress(data), len(data)) * times
+            + mcap_record(15, bytes(4)) + mcap_record(2, bytes(20)) + MCAP_HEAD[:8])
 
 
 def test_chunks_that_unpack_to_more_than_memory_holds_are_refused(tmp_path, monkeypatch):
@@ -945,8 +922,8 @@ def test_chunks_that_unpack_to_more_than_memory_holds_are_refused(tmp_path, monk
     monkeypatch.setattr(chunked, 'MOST_WAITING', 1000)
     monkeypatch.setattr(chunked, 'MOST_HELD', 1 << 20)
     message = struct.pack('<HIQQ', 1, 0, 1, 1)
-    for data in (mcap_of(lambda record: record(5, message) * 501, 2),
-                 mcap_of(lambda record: record(5, message + bytes((1 << 20) // 5)), 6)):
+    for data in (mcap_of(mcap_record(5, message) * 501, 2),
+                 mcap_of(mcap_record(5, message + bytes((1 << 20) // 5)), 6)):
         (tmp_path / 'bomb').write_bytes(data)
         with pytest.raises(BrokenFile, match='so far out of order, at byte .* chunks in memory'):
             next(open_storage(tmp_path / 'bomb').messages({1}))
