@@ -116,20 +116,17 @@ class SequenceRecording(Recording):
         """
         self._sequence = sequence
         self._damaged = damaged
-        # Ground truth: poses with stamps of their own, or one pose per image (or None).
-        self._stamped: tuple[NDArray[np.int64], Array] | None = None
-        self._poses = sequence.poses
+        # Poses with stamps of their own, or with None one per image, if any are known.
+        self._truth_ns: NDArray[np.int64] | None = None
+        self._truth = sequence.poses
         if poses is not None:
-            stamps, truth = _read_truth(poses, len(sequence))
-            self._stamped = None if stamps is None else (stamps, truth)
-            self._poses = truth if stamps is None else None
+            self._truth_ns, self._truth = _read_truth(poses, len(sequence))
         self.ground_truth_file = poses
         self._imu = sequence.imu if imu else None
         # By ROS convention the topic's name shows whether images are rectified.
         self.image_topic = RAW_IMAGE_TOPIC if sequence.distorted else IMAGE_TOPIC
         self.info_topic = INFO_TOPIC
-        known = self._poses is not None or self._stamped is not None
-        self.ground_truth_topic = GROUND_TRUTH_TOPIC if known else None
+        self.ground_truth_topic = None if self._truth is None else GROUND_TRUTH_TOPIC
         self.auxiliary = {} if self._imu is None else {'imu': IMU_TOPIC,
                                                        'frames': static_frames.TOPIC}
 
@@ -146,7 +143,8 @@ class SequenceRecording(Recording):
         """
         sequence = self._sequence
         samples: Iterator[BagMessage] = iter(())
-        yield from _stamped_poses(self._stamped)
+        if self._truth is not None and self._truth_ns is not None:
+            yield from _stamped_poses(self._truth_ns, self._truth)
         if self._imu is not None and (
                 topics is None or not set(topics).isdisjoint(self.auxiliary.values())):
             yield _imu_frame(int(sequence.stamps_ns[0]), self._imu)
@@ -156,8 +154,9 @@ class SequenceRecording(Recording):
                 yield sample
                 if sample.stamp_ns >= stamp:
                     break
-            if self._poses is not None and np.isfinite(self._poses[index]).all():
-                yield _ground_truth(stamp, self._poses[index])
+            if self._truth is not None and self._truth_ns is None \
+                    and np.isfinite(self._truth[index]).all():
+                yield _ground_truth(stamp, self._truth[index])
             if topics is None or self.image_topic in topics:
                 yield BagMessage(INFO_TOPIC, stamp, MAKE.camera_info(
                     stamp, CAMERA_FRAME, sequence.K, sequence.size, sequence.distortion,
@@ -233,7 +232,7 @@ class BagRecording(Recording):
         if stamps is None:
             yield from self._with_poses(wanted, poses)
             return
-        yield from _stamped_poses((stamps, poses))
+        yield from _stamped_poses(stamps, poses)
         yield from self.bag.messages(wanted)
 
     def _with_poses(self, wanted: set[str], poses: Array) -> Iterator[BagMessage]:
@@ -381,11 +380,10 @@ def _read_truth(path: Path, images: int) -> tuple[NDArray[np.int64] | None, Arra
     return None, poses
 
 
-def _stamped_poses(known: tuple[NDArray[np.int64], Array] | None) -> Iterator[BagMessage]:
-    """Yield messages of poses with stamps of their own, if there are any."""
-    if known is not None:
-        for stamp, pose in zip(known[0].tolist(), known[1], strict=True):
-            yield _ground_truth(stamp, pose)
+def _stamped_poses(stamps_ns: NDArray[np.int64], poses: Array) -> Iterator[BagMessage]:
+    """Yield messages of poses with stamps of their own."""
+    for stamp, pose in zip(stamps_ns.tolist(), poses, strict=True):
+        yield _ground_truth(stamp, pose)
 
 
 def _ground_truth(stamp: int, pose: Array) -> BagMessage:
