@@ -1,6 +1,7 @@
 """``djet replay``: what it writes, and its error messages."""
 
 import csv
+from itertools import count
 import json
 import os
 from pathlib import Path
@@ -41,6 +42,7 @@ from djet_ros.replay.results import ResultsFolder
 import numpy as np
 import pytest
 from ros_messages import camera_info, header, image, message_type, record
+from rosbags.rosbag2 import Writer
 
 FRAMES = 6
 STEP = pose(x=0.25, z=0.15, yaw=0.01)
@@ -991,40 +993,33 @@ def test_interrupted_run_is_readable_and_marked_incomplete(tmp_path, sign, code)
         assert len(list(out.messages({'/vo_node/odometry'}))) > 5
 
 
-@pytest.mark.slow
-def test_a_signal_within_a_write_waits_until_the_frame_is_in_all_results(folder, tmp_path):
+@pytest.mark.parametrize('place', range(1, 11, 3))
+def test_a_signal_within_a_write_waits_until_the_frame_is_in_all_results(
+        place, folder, tmp_path, monkeypatch):
     """The signal comes at several places within what rosbags writes of a frame."""
-    within = """
-import signal, sys
-from djet_ros.cli.main import main
-from rosbags.rosbag2 import Writer
-left, records, write = int(sys.argv.pop(1)), 0, Writer.write
-def counted(*arguments):
-    global records
-    records += 1
-    if records == 9:
-        sys.setprofile(watch)
-    write(*arguments)
-def watch(frame, event, _):
-    global left
-    if event == 'call' and 'rosbags' in frame.f_code.co_filename:
-        left -= 1
-        if not left:
-            sys.setprofile(None)
-            signal.raise_signal(signal.SIGTERM)
-Writer.write = counted
-sys.exit(main())
-"""
-    for place in range(1, 11, 3):
-        results = tmp_path / str(place)
-        ended = subprocess.run([sys.executable, '-c', within, str(place), 'replay', folder,
-                                '--output', results], capture_output=True, text=True, check=False)
-        assert ended.returncode == 143, ended.stderr
-        with Bag(results / 'bag') as out:
-            written = list(out.messages({'/vo_node/odometry'}))
-        poses = (results / 'trajectory_tum.txt').read_text().splitlines()
-        rows = (results / 'frames.csv').read_text().splitlines()[1:]
-        assert 0 < len(written) == len(poses) == len(rows) < FRAMES
+    records, write, left = count(1), Writer.write, place
+
+    def watch(frame, event, _):
+        nonlocal left
+        if event == 'call' and 'rosbags' in frame.f_code.co_filename:
+            left -= 1
+            if not left:
+                sys.setprofile(None)
+                signal.raise_signal(signal.SIGTERM)
+
+    def watched(*arguments):
+        if next(records) == 9:
+            sys.setprofile(watch)
+        write(*arguments)
+
+    monkeypatch.setattr(Writer, 'write', watched)
+    results = tmp_path / 'results'
+    djet('replay', folder, '--output', results, expect=143)
+    with Bag(results / 'bag') as out:
+        written = list(out.messages({'/vo_node/odometry'}))
+    poses = (results / 'trajectory_tum.txt').read_text().splitlines()
+    rows = (results / 'frames.csv').read_text().splitlines()[1:]
+    assert 0 < len(written) == len(poses) == len(rows) < FRAMES
 
 
 # Sources of ground truth
