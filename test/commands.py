@@ -53,7 +53,7 @@ def contents(folder: Path) -> dict[Path, bytes]:
 
 def alone(*words: object, **settings: str) -> CompletedProcess[str]:
     """Run a command in a process of its own, with these variables of the environment."""
-    return subprocess.run([*DJET, *map(str, words)], capture_output=True, text=True, timeout=120,
+    return subprocess.run([*DJET, *map(str, words)], capture_output=True, text=True, timeout=300,
                           check=False, env={**os.environ, **settings})
 
 

@@ -35,7 +35,8 @@ POSE_TOPIC = '/vo_node/odometry'
 @pytest.fixture(scope='module')
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write a drive to and fro of 3000 frames, which takes far longer than any test waits."""
-    return filmed(tmp_path_factory.mktemp('drive') / 'sequences' / '00', STEP, 3000)
+    return filmed(tmp_path_factory.mktemp('drive') / 'sequences' / '00',
+                  [np.linalg.matrix_power(STEP, i) for i in range(6)], 3000)
 
 
 def read_back(results: Path) -> tuple[int, int, int]:

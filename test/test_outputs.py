@@ -157,7 +157,7 @@ def test_figures_without_a_place_are_refused_before_they_are_measured(
 def test_figures_that_find_a_full_disk_are_named(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     output = tmp_path / 'results' / 'f.json'
-    sequence = filmed(tmp_path / 'sequence', pose(x=0.25), 3)
+    sequence = filmed(tmp_path / 'sequences' / '00', [pose(x=0.25 * i) for i in range(3)])
     with full_disk():
         assert main(['lab', 'closure', str(sequence), '--methods', 'rpe', '--output',
                      str(output)]) == 2

@@ -46,17 +46,14 @@ from rosbags.rosbag2 import Writer
 
 FRAMES = 6
 STEP = pose(x=0.25, z=0.15, yaw=0.01)
+POSES = [np.linalg.matrix_power(STEP, i) for i in range(FRAMES)]
 SECOND = 10**9
 
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
     """Write a small KITTI sequence with ground truth, and return its folder."""
-    root = tmp_path_factory.mktemp('dataset')
-    (root / 'poses').mkdir()
-    np.savetxt(root / 'poses' / '00.txt', [
-        np.linalg.matrix_power(STEP, i)[:3].ravel() for i in range(FRAMES)])
-    return filmed(root / 'sequences' / '00', STEP, FRAMES)
+    return filmed(tmp_path_factory.mktemp('dataset') / 'sequences' / '00', POSES)
 
 
 @pytest.fixture(scope='module')
@@ -74,22 +71,21 @@ def stamp_at(frame):
 def true_poses(path, stamp=stamp_at):
     """Write the poses of the drive, with the stamp of each frame, as a TUM file."""
     with TumWriter(path) as truth:
-        for i in range(FRAMES):
-            truth.write(stamp(i), np.linalg.matrix_power(STEP, i))
+        for i, here in enumerate(POSES):
+            truth.write(stamp(i), here)
     return path
 
 
 def drive(change=lambda i, message: message, info=True):
     """Yield the messages of a drive; change makes another message of an image (or None)."""
-    cards, here = Cards(), np.eye(4)
-    for i in range(FRAMES):
+    cards = Cards()
+    for i, here in enumerate(POSES):
         stamp = stamp_at(i)
         if info:
             yield INFO_TOPIC, camera_info(K, SIZE, stamp), stamp
         message = change(i, image(cards.gray(here), stamp_ns=stamp))
         if message is not None:
             yield IMAGE_TOPIC, message, stamp
-        here = here @ STEP
 
 
 def summary(results):
@@ -193,8 +189,7 @@ def test_tf_of_a_recording_gives_the_lengths_through_moving_frames(tmp_path):
     djet('replay', path, '--output', tmp_path / 'out', *call)
     assert summary(tmp_path / 'out')['pairs_of_known_scale'] == FRAMES - 1
     _, camera = read_tum(tmp_path / 'out' / 'trajectory_tum.txt')
-    true = [np.linalg.matrix_power(STEP, i)[:3, 3] for i in range(FRAMES)]
-    assert np.allclose(camera[:, :3, 3], true, atol=0.02)
+    assert np.allclose(camera[:, :3, 3], [here[:3, 3] for here in POSES], atol=0.02)
     without = djet('replay', record(tmp_path / 'none', drive()), '--output', tmp_path / 'no',
                    *call, expect=2)
     assert 'has no topic /tf, which odometry.guess_frame requires' in without.stderr
@@ -971,7 +966,7 @@ def test_constant_stamps_give_a_warning(goes_on, tmp_path):
 @pytest.mark.parametrize('sign, code', [
     (signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_interrupted_run_is_readable_and_marked_incomplete(tmp_path, sign, code):
-    endless = filmed(tmp_path / 'sequences' / '01', STEP, 2000)
+    endless = filmed(tmp_path / 'sequences' / '01', POSES, 2000)
     results = tmp_path / 'results'
     process = subprocess.Popen([*DJET, 'replay', endless, '--output', results],
                                stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
@@ -1080,9 +1075,9 @@ def test_a_ground_truth_that_is_not_of_the_camera_gives_a_warning(child, warned,
              for name in ('TransformStamped', 'Transform', 'Vector3')}
 
     def truth():
-        for i in range(FRAMES):
+        for i, here in enumerate(POSES):
             stamp = stamp_at(i)
-            stamped = MAKE.pose_in(stamp, 'world', np.linalg.matrix_power(STEP, i))
+            stamped = MAKE.pose_in(stamp, 'world', here)
             at = stamped.pose.position
             yield '/ground_truth/state', kinds['TransformStamped'](
                 stamped.header, child, kinds['Transform'](
