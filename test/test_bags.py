@@ -36,6 +36,7 @@ from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 K = np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
 SECOND = 10**9
+NOETIC = get_typestore(Stores.ROS1_NOETIC)
 
 
 def image(stamp, size=(64, 48)):
@@ -64,20 +65,19 @@ def camera_messages(count=30):
         yield '/cam/image_raw', image(stamp), stamp
 
 
+def of_ros1(message, **changed):
+    """Return a message in the class of ROS 1: upper-case K, header.seq; changed: other fields."""
+    kind, header = message.__msgtype__, message.header
+    fields = {name: getattr(message, name.lower() if len(name) == 1 else name)
+              for name, _ in NOETIC.fielddefs[kind][1]}
+    stamp = NOETIC.types['builtin_interfaces/msg/Time'](header.stamp.sec, header.stamp.nanosec)
+    fields['header'] = NOETIC.types['std_msgs/msg/Header'](
+        seq=7, stamp=stamp, frame_id=header.frame_id)
+    return NOETIC.types[kind](**{**fields, **changed})
+
+
 def ros1_bag(path, count=30, compression=None):
-    """Write the camera of a ROS 1 robot: upper-case K, header.seq."""
-    noetic = get_typestore(Stores.ROS1_NOETIC)
-    types = noetic.types
-
-    def old(message):
-        fields = {name: getattr(message, name.lower() if len(name) == 1 else name)
-                  for name, _ in noetic.fielddefs[message.__msgtype__][1] if name != 'header'}
-        stamp = message.header.stamp
-        fields['header'] = types['std_msgs/msg/Header'](
-            seq=7, stamp=types['builtin_interfaces/msg/Time'](stamp.sec, stamp.nanosec),
-            frame_id=message.header.frame_id)
-        return types[message.__msgtype__](**fields)
-
+    """Write the camera of a ROS 1 robot."""
     writer = Ros1Writer(path)
     writer.chunk_threshold = 20_000
     if compression:
@@ -87,8 +87,9 @@ def ros1_bag(path, count=30, compression=None):
         for topic, message, stamp in camera_messages(count):
             kind = message.__msgtype__
             if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=noetic)
-            writer.write(connections[topic], stamp, noetic.serialize_ros1(old(message), kind))
+                connections[topic] = writer.add_connection(topic, kind, typestore=NOETIC)
+            writer.write(connections[topic], stamp,
+                         NOETIC.serialize_ros1(of_ros1(message), kind))
     return path
 
 
@@ -566,19 +567,11 @@ def test_of_several_ground_truths_none_is_chosen_nor_taken_for_a_measurement(tmp
 
 
 def test_messages_within_messages_of_ros_1_are_those_of_jazzy(tmp_path):
-    noetic = get_typestore(Stores.ROS1_NOETIC)
-
-    def old(message, **fields):
-        kind, header = message.__msgtype__, message.header
-        stamp = noetic.types['builtin_interfaces/msg/Time'](header.stamp.sec, header.stamp.nanosec)
-        return noetic.types[kind](header=noetic.types['std_msgs/msg/Header'](
-            seq=7, stamp=stamp, frame_id=header.frame_id), **fields)
-
     path = MAKE.path([MAKE.pose_in(SECOND + i, 'odom', np.eye(4)) for i in range(3)])
-    message = old(path, poses=[old(one, pose=one.pose) for one in path.poses])
+    message = of_ros1(path, poses=[of_ros1(one) for one in path.poses])
     with Ros1Writer(tmp_path / 'old.bag') as writer:
-        connection = writer.add_connection('/path', message.__msgtype__, typestore=noetic)
-        writer.write(connection, SECOND, noetic.serialize_ros1(message, message.__msgtype__))
+        connection = writer.add_connection('/path', message.__msgtype__, typestore=NOETIC)
+        writer.write(connection, SECOND, NOETIC.serialize_ros1(message, message.__msgtype__))
     with Bag(tmp_path / 'old.bag') as bag:
         read, = bag.messages()
     assert read.message == path
@@ -998,8 +991,7 @@ def test_messages_that_may_unfold_to_more_than_memory_holds_are_refused(encoding
 
 def test_transforms_that_unfold_to_many_times_their_bytes_are_refused():
     """Of 1.7 million transforms in 129 MB, few enough bytes, the objects would take gigabytes."""
-    noetic = get_typestore(Stores.ROS1_NOETIC)
-    one, _ = noetic.generate_msgdef('geometry_msgs/msg/TransformStamped')
+    one, _ = NOETIC.generate_msgdef('geometry_msgs/msg/TransformStamped')
     definition = (f'geometry_msgs/TransformStamped[] transforms\n{"=" * 80}\n'
                   f'MSG: geometry_msgs/TransformStamped\n{one}')
     read = decoder(Connection(0, '/tf', 'tf2_msgs/msg/TFMessage', 'ros1', definition, 1))
