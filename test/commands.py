@@ -7,6 +7,7 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 import os
 from pathlib import Path
 import resource
+import signal
 import subprocess
 from subprocess import CompletedProcess
 import sys
@@ -51,6 +52,18 @@ def contents(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob('*') if path.is_file()}
 
 
+@contextmanager
+def usual_signals() -> Iterator[None]:
+    """Handle signals as a new process does, and afterwards as before: commands replace that."""
+    kept = [(number, signal.signal(number, usual)) for number, usual in (
+        (signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL))]
+    try:
+        yield
+    finally:
+        for number, handler in kept:
+            signal.signal(number, handler)
+
+
 def alone(*words: object, **settings: str) -> CompletedProcess[str]:
     """Run a command in a process of its own, with these variables of the environment."""
     return subprocess.run([*DJET, *map(str, words)], capture_output=True, text=True, timeout=300,
@@ -74,7 +87,7 @@ def djet(*words: object, encoding: str = 'utf-8') -> CompletedProcess[str]:
     call = [str(word) for word in words]
     sys.stdout.flush()
     sys.stderr.flush()
-    with redirected(1) as out, redirected(2) as err:
+    with usual_signals(), redirected(1) as out, redirected(2) as err:
         with open(1, 'w', encoding=encoding, closefd=False) as stdout, \
                 open(2, 'w', buffering=1, encoding='utf-8', errors='backslashreplace',
                      closefd=False) as stderr, \
