@@ -1,5 +1,9 @@
 """A small world of textured cards at several depths: exact views of it, made in milliseconds."""
 
+from collections.abc import Sequence
+import os
+from pathlib import Path
+
 import cv2
 from djet_ros.odometry.frame import Frame
 import numpy as np
@@ -44,6 +48,30 @@ class Cards:
     def frame(self, seconds: float, pose: np.ndarray = REST, **more) -> Frame:
         """Render the cards as a frame."""
         return Frame(self.gray(pose, **more), K, round(seconds * 1e9), 'camera')
+
+
+def filmed(folder: Path, poses: Sequence[np.ndarray], frames: int = 0, noise: bool = False
+           ) -> Path:
+    """
+    Write the cards from some poses as a KITTI sequence with its ground truth; return its folder.
+
+    If more frames are wanted, the camera goes to and fro, and their images are links.
+    """
+    images, cards = folder / 'image_0', Cards()
+    truth = folder.parents[1] / 'poses' / f'{folder.name}.txt'
+    images.mkdir(parents=True)
+    truth.parent.mkdir(exist_ok=True)
+    for i, here in enumerate(poses):
+        cv2.imwrite(str(images / f'{i:06d}.png'), cards.gray(here, i if noise else None))
+    last = len(poses) - 1
+    places = [last - abs(last - i % (2 * last)) for i in range(max(frames, len(poses)))]
+    for i, place in enumerate(places[len(poses):], len(poses)):
+        os.link(images / f'{place:06d}.png', images / f'{i:06d}.png')
+    row = ' '.join(str(v) for v in np.hstack([K, np.zeros((3, 1))]).ravel())
+    (folder / 'calib.txt').write_text(f'P0: {row}\n')
+    (folder / 'times.txt').write_text(''.join(f'{0.1 * i:.6e}\n' for i in range(len(places))))
+    np.savetxt(truth, [poses[place][:3].ravel() for place in places])
+    return folder
 
 
 def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> np.ndarray:

@@ -31,7 +31,7 @@ from djet_ros.odometry.tracker import Tracker
 from djet_ros.recordings.bag_writers import ResultBag, write_kitti_bag
 from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.datasets import euroc, plain_images, seven_scenes, tum_rgbd
-from djet_ros.recordings.decoding import decoder, jazzy, message_type
+from djet_ros.recordings.decoding import decoder, message_type
 from djet_ros.recordings.frame_sequence import FrameSequence
 from djet_ros.recordings.kitti import KittiSequence, read_camera, read_poses
 from djet_ros.recordings.kitti_raw import kitti_raw
@@ -42,9 +42,9 @@ from djet_ros.recordings.trajectories import KittiWriter, read_tum, TumWriter
 from djet_ros.recordings.varos import varos
 from djet_ros.replay.graph_of_results import read_results
 import numpy as np
-from ros_messages import camera_info, compressed, header, image, roi, serialised
+from ros_messages import camera_info, compressed, header, image, record, roi, serialised
 from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionMode
 from rosbags.typesys import get_typestore, Stores
 
 # Beyond this an error is no line for a terminal any more.
@@ -278,17 +278,9 @@ def recorded() -> Iterator[tuple[str, Any, int]]:
         yield '/cam/image', image(PICTURE[:16, :16], stamp_ns=i * SECOND), i * SECOND
 
 
-def bag_bytes(storage: StoragePlugin, mode: CompressionMode = CompressionMode.NONE) -> bytes:
+def bag_bytes(storage: str, mode: CompressionMode = CompressionMode.NONE) -> bytes:
     with folder() as place:
-        writer = Writer(place / 'bag', version=9, storage_plugin=storage)
-        writer.set_compression(mode, CompressionFormat.ZSTD)
-        with writer:
-            known: dict[str, Any] = {}
-            for topic, message, stamp in recorded():
-                kind = message.__msgtype__
-                if topic not in known:
-                    known[topic] = writer.add_connection(topic, kind, typestore=jazzy())
-                writer.write(known[topic], stamp, serialised(message))
+        record(place / 'bag', recorded(), storage, mode)
         data, = (path.read_bytes() for path in (place / 'bag').iterdir()
                  if path.suffix != '.yaml')
         return data
@@ -300,14 +292,14 @@ def mcap_seeds() -> list[bytes]:
             for topic, message, stamp in recorded():
                 bag.write(topic, message, stamp)
         chunked = (place / 'bag' / 'bag.mcap').read_bytes()
-    plain = bag_bytes(StoragePlugin.MCAP)
+    plain = bag_bytes('mcap')
     return [chunked, plain, plain[:len(plain) // 2],
-            bag_bytes(StoragePlugin.MCAP, CompressionMode.STORAGE),
-            bag_bytes(StoragePlugin.MCAP, CompressionMode.FILE)]
+            bag_bytes('mcap', CompressionMode.STORAGE),
+            bag_bytes('mcap', CompressionMode.FILE)]
 
 
 def sqlite_seeds() -> list[bytes]:
-    plain = bag_bytes(StoragePlugin.SQLITE3)
+    plain = bag_bytes('sqlite3')
     with folder() as place:
         humble = place / 'humble.db3'
         humble.write_bytes(plain)
@@ -315,7 +307,7 @@ def sqlite_seeds() -> list[bytes]:
         database.executescript('DROP TABLE message_definitions; DROP TABLE schema; VACUUM')
         database.close()
         return [plain, humble.read_bytes(),
-                bag_bytes(StoragePlugin.SQLITE3, CompressionMode.MESSAGE)]
+                bag_bytes('sqlite3', CompressionMode.MESSAGE)]
 
 
 def ros1_seeds() -> list[bytes]:
@@ -353,7 +345,7 @@ def metadata_of(data: bytes) -> None:
 
 @cache
 def mcap_seed() -> bytes:
-    return bag_bytes(StoragePlugin.MCAP)
+    return bag_bytes('mcap')
 
 
 def metadata_seeds() -> list[bytes]:

@@ -1,6 +1,8 @@
-"""Messages of cameras, in the classes of rosbags for ROS 2 Jazzy."""
+"""Messages of cameras, in the classes of rosbags for ROS 2 Jazzy, and bags of them."""
 
+from djet_ros.recordings.bag_writers import STORAGES
 import numpy as np
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
 from rosbags.typesys import get_typestore, Stores
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -66,6 +68,20 @@ def camera_info(K, size, stamp_ns=0, **changes):
 def roi(x, y, width, height):
     return message_type('sensor_msgs/msg/RegionOfInterest')(
         x_offset=x, y_offset=y, height=height, width=width, do_rectify=False)
+
+
+def record(path, messages, storage='mcap', mode=CompressionMode.NONE, store=STORE):
+    """Write (topic, message, stamp) with rosbags; mode FILE, MESSAGE or STORAGE compresses."""
+    writer = Writer(path, version=9, storage_plugin=STORAGES[storage])
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    connections = {}
+    with writer:
+        for topic, message, stamp in messages:
+            kind = message.__msgtype__
+            if (topic, kind) not in connections:
+                connections[topic, kind] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(connections[topic, kind], stamp, store.serialize_cdr(message, kind))
+    return path
 
 
 def serialised(message):

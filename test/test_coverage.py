@@ -224,6 +224,7 @@ def test_in_a_row_a_sequence_is_measured_as_the_odometry_sees_it(tmp_path: Path)
     (('--scenes', 'road', '--seeds', '1-2-3'), "'1-2-3'"),
     (('--scenes', 'road', '--seeds', '0-3,2'), "'0-3,2' is not a list of different seeds"),
     (('--scenes', 'road', '--seeds', '0-99999999999'), "'0-99999999999' has more than"),
+    (('--scenes', 'road', '--seeds', '0-20000,20000-0'), "'0-20000,20000-0' has more than"),
     (('--scenes', 'road,blur,road'), "scene 'road' is given twice"),
     (('--scenes', 'road', '--frames', 1), '--frames is 1'), (('nowhere',), 'nowhere')])
 def test_user_errors_are_one_line_and_exit_code_2(

@@ -258,11 +258,3 @@ def test_a_wrong_euroc_folder_is_named(asl, file, old, new, error_text):
     with pytest.raises(DjetError, match=error_text) as caught:
         euroc(asl)
     assert '\n' not in str(caught.value)
-
-
-@pytest.mark.parametrize('left', ['', '%YAML:1.0\n', '%YAML:1.0\n---\n', '%YAML:1.0\n---\nsens'])
-def test_a_camera_description_that_is_cut_at_its_head_is_one_line(asl, left):
-    (asl / 'mav0/cam0/sensor.yaml').write_text(left)
-    with pytest.raises(DjetError, match='it has no T_BS') as caught:
-        euroc(asl)
-    assert '\n' not in str(caught.value)

@@ -26,11 +26,11 @@ def shown(printed: object) -> str:
 def test_only_the_status_of_the_named_node_is_shown() -> None:
     view = Monitor('left/vo_node')
     for other in ('right/vo_node', 'vo_node', 'very/left/vo_node'):
-        view.diagnostics(diagnostics(other, 'lost'))
-    view.diagnostics(diagnostics('left/vo_node', 'lost', 'pose graph'))
-    assert (view.summary, view.updated) == ('no diagnostics received yet', False)
-    view.diagnostics(diagnostics('left/vo_node', 'tracking'))
-    view.diagnostics(diagnostics('right/vo_node', 'lost'))
+        assert not view.diagnostics(diagnostics(other, 'lost'))
+    assert not view.diagnostics(diagnostics('left/vo_node', 'lost', 'pose graph'))
+    assert view.summary == 'no diagnostics received yet'
+    assert view.diagnostics(diagnostics('left/vo_node', 'tracking'))
+    assert not view.diagnostics(diagnostics('right/vo_node', 'lost'))
     assert (view.summary, view.values) == ('tracking', {'frames processed': '9'})
 
 

@@ -37,7 +37,7 @@ from djet_ros.lab.summary import table_rows
 from djet_ros.lab.tables import results_table
 from djet_ros.odometry.camera import Camera
 from djet_ros.recordings.bag_writers import write_kitti_bag
-from djet_ros.recordings.frame_sequence import FrameSequence, ImageFiles
+from djet_ros.recordings.frame_sequence import FrameSequence, ImageFiles, Intrinsics
 from djet_ros.recordings.kitti import KittiSequence
 from djet_ros.recordings.trajectories import read_tum
 from djet_ros.replay.drift import drift
@@ -46,7 +46,6 @@ import pytest
 
 pytestmark = pytest.mark.slow
 
-DJET = [sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; sys.exit(main())']
 COLUMNS = ['sequence', 'method', 'preset', 'pairs', 'failures', 'rotation_told',
            'rotation_mean_deg', 'rotation_median_deg', 'rotation_p95_deg', 'translation_told',
            'translation_mean_deg', 'translation_median_deg', 'translation_p95_deg',
@@ -87,8 +86,7 @@ def djet(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 def djet_alone(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     """Run the command in a process of its own: a client of Dask leaves threads behind."""
-    return subprocess.run([*DJET, 'lab', *map(str, arguments)], capture_output=True, text=True,
-                          timeout=300, check=False)
+    return commands.alone('lab', *arguments)
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -302,8 +300,8 @@ def torn_truth(road: Path, folder: Path) -> Path:
 def test_no_method_has_features_where_the_lens_shows_nothing(road, tmp_path):
     """Neither in files nor in what is taken out of a bag."""
     D, rendered = [0.3, 0.1, 0.0, 0.0, 0.0], KittiSequence(road, end=3)
-    files = FrameSequence('lens', ImageFiles(rendered.frame_paths), rendered.K,
-                          rendered.stamps_ns, None, D)
+    files = FrameSequence('lens', ImageFiles(rendered.frame_paths), Intrinsics(rendered.K, D),
+                          rendered.stamps_ns, None)
     write_kitti_bag(files, tmp_path / 'bag')
     bag = readable_frames(tmp_path / 'bag', tmp_path)
     unseen = Camera(files.K, np.array(D), files.size).unseen(files.size[::-1])
@@ -380,7 +378,7 @@ def test_a_dask_cluster_writes_the_same_bytes(road, short, tmp_path):
 def running(road: Path, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """Return a run with one worker whose first chunk is done and whose second is not."""
     process = subprocess.Popen(
-        [*DJET, 'lab', 'evaluate', str(road), '--output', str(tmp_path), '--workers', '1', *RUN],
+        [*commands.DJET, 'lab', 'evaluate', road, '--output', tmp_path, '--workers', '1', *RUN],
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     wait_for(lambda: len(chunks(tmp_path)) == 1)
     yield process
@@ -488,7 +486,7 @@ LONG = {'evaluate': ('ROAD',) * 40, 'coverage': ('--scenes', 'road', '--frames',
 @pytest.mark.parametrize('verb', LONG)
 def test_ctrl_c_in_a_terminal_ends_all_processes_at_once_in_one_line(verb, moment, road, tmp_path):
     call = [str(road) if word == 'ROAD' else word for word in LONG[verb]]
-    process = subprocess.Popen([*DJET, 'lab', verb, *call, '--output', str(tmp_path),
+    process = subprocess.Popen([*commands.DJET, 'lab', verb, *call, '--output', tmp_path,
                                 '--workers', '2'], stdout=subprocess.DEVNULL,
                                stderr=subprocess.PIPE, text=True, start_new_session=True)
     enough = 0.0 if moment == 'while a worker starts' else 2.5

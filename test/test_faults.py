@@ -10,50 +10,33 @@ from pathlib import Path
 import shutil
 import signal
 import subprocess
-import sys
 import time
 
-from cards import Cards, K, pose
-import commands
+from cards import filmed, pose
+from commands import contents, DJET, djet
 from conftest import write_small_kitti
-import cv2
 from djet_ros.cli.main import main
 from djet_ros.errors import DjetError
 from djet_ros.recordings.bags import Bag
+from djet_ros.recordings.recording import IMAGE_TOPIC
 from djet_ros.recordings.trajectories import read_tum
+from djet_ros.replay.results import UNFINISHED
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
 pytestmark = pytest.mark.slow
 
-DJET = [sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; sys.exit(main())']
 STEP = pose(x=0.25, z=0.15, yaw=0.01)
 ONE_THREAD = {**os.environ, 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
 POSE_TOPIC = '/vo_node/odometry'
 
 
-def djet(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*DJET, *map(str, arguments)], capture_output=True, text=True,
-                          timeout=120, check=False, env=ONE_THREAD)
-
-
 @pytest.fixture(scope='module')
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write a drive to and fro of 3000 frames, which takes far longer than any test waits."""
-    folder = tmp_path_factory.mktemp('drive') / 'sequences' / '00'
-    (folder / 'image_0').mkdir(parents=True)
-    cards, here, different, frames = Cards(), np.eye(4), 6, 3000
-    for i in range(different):
-        cv2.imwrite(str(folder / 'image_0' / f'{i:06d}.png'), cards.gray(here))
-        here = here @ STEP
-    for i in range(different, frames):
-        back = different - 1 - abs(different - 1 - i % (2 * different - 2))
-        os.link(folder / 'image_0' / f'{back:06d}.png', folder / 'image_0' / f'{i:06d}.png')
-    row = ' '.join(str(v) for v in np.hstack([K, np.zeros((3, 1))]).ravel())
-    (folder / 'calib.txt').write_text(f'P0: {row}\n')
-    (folder / 'times.txt').write_text(''.join(f'{0.1 * i:.6e}\n' for i in range(frames)))
-    return folder
+    return filmed(tmp_path_factory.mktemp('drive') / 'sequences' / '00',
+                  [np.linalg.matrix_power(STEP, i) for i in range(6)], 3000)
 
 
 def read_back(results: Path) -> tuple[int, int, int]:
@@ -100,13 +83,14 @@ def test_data_written_before_a_kill_is_readable(drive, tmp_path, seed):
     # The bag holds back the newest stamp, and a kill may fall between two files.
     assert delivered >= poses - 2
     summary = json.loads((results / 'summary.json').read_text())
-    assert summary['complete'] is False
-    before = {path: path.read_bytes() for path in results.rglob('*') if path.is_file()}
-    again = commands.djet('replay', drive, '--output', results)
+    assert summary == {'source': str(drive), 'image_topic': IMAGE_TOPIC, 'method': 'djet',
+                       'preset': 'best', 'scale': 'structure', **UNFINISHED}
+    before = contents(results)
+    again = djet('replay', drive, '--output', results)
     assert again.returncode == 2
     assert again.stderr == (f'djet: error: {results} holds earlier results; choose another '
                             '--output, or replace them with --overwrite\n')
-    assert before == {path: path.read_bytes() for path in results.rglob('*') if path.is_file()}
+    assert before == contents(results)
 
 
 @pytest.fixture
@@ -174,8 +158,8 @@ def test_a_disk_that_is_full_from_the_start_is_named_and_bars_no_retry(drive, di
 def test_a_disk_that_is_read_only_is_named(drive, disk, command):
     # Modes do not hold root back; this does.
     place = disk('size=1m,ro')
-    done = commands.djet(*(word.replace('DRIVE', str(drive)).replace('DISK', str(place))
-                           for word in command))
+    done = djet(*(word.replace('DRIVE', str(drive)).replace('DISK', str(place))
+                  for word in command))
     assert done.returncode == 2
     assert done.stderr.splitlines()[-1].startswith('djet: error: ')
     assert str(place) in done.stderr
@@ -184,12 +168,6 @@ def test_a_disk_that_is_read_only_is_named(drive, disk, command):
 
 
 # Existing output
-
-
-def contents(path: Path) -> object:
-    if path.is_file():
-        return path.read_bytes()
-    return {inner: inner.read_bytes() for inner in path.rglob('*') if inner.is_file()}
 
 
 COMMANDS = {
@@ -207,15 +185,13 @@ def test_a_second_run_changes_nothing_and_names_the_option_to_replace(tmp_path, 
                  .replace('IMAGE', str(sequence / 'image_0' / '000000.png'))
                  for word in COMMANDS[name]]
     assert main(arguments) == 0
-    out = next(tmp_path.glob('out*'))
-    before = contents(out)
-    assert before
+    before = contents(tmp_path)
     capsys.readouterr()
     assert main(arguments) == 2
     printed = capsys.readouterr().err.splitlines()[-1]
     assert printed.startswith('djet: error: ')
     assert '--overwrite' in printed
-    assert contents(out) == before
+    assert contents(tmp_path) == before
     assert main([*arguments, '--overwrite']) == 0
 
 

@@ -92,7 +92,7 @@ DAMAGES = {
     'times.txt has 5 lines for 6 images': lambda f: cut_last_line(f / 'times.txt'),
     '07.txt has 5 lines for 6 images': lambda f: cut_last_line(f / '../../poses/07.txt'),
     "times.txt line 2: 'abc' is not a": lambda f: replace(f / 'times.txt', '1.036223e-01', 'abc'),
-    "'nan' is not a finite number": lambda f: replace(f / 'times.txt', '1.036223e-01', 'nan'),
+    "'nan' is not a stamp": lambda f: replace(f / 'times.txt', '1.036223e-01', 'nan'),
     "'-1' is not a stamp": lambda f: replace(f / 'times.txt', '0.000000e+00', '-1'),
     "'1e300' is not a stamp": lambda f: replace(f / 'times.txt', '1.036223e-01', '1e300'),
     'is not after the one before': lambda f: replace(f / 'times.txt', '1.036223e-01', '0'),
@@ -105,7 +105,7 @@ DAMAGES = {
         lambda f: replace(f / '../../poses/07.txt', ' 0.000000000000e+00\n', ' 1e300\n'),
     "no line 'P0:'": lambda f: replace(f / 'calib.txt', 'P0:', 'P5:'),
     'P0 has 13 numbers': lambda f: replace(f / 'calib.txt', 'P0:', 'P0: 1'),
-    "calib.txt line 1: '60.5x' is not a": lambda f: replace(f / 'calib.txt', '60.5', '60.5x'),
+    "calib.txt line 1: P0: '60.5x' is not a": lambda f: replace(f / 'calib.txt', '60.5', '60.5x'),
     'P0 is no projection': lambda f: replace(f / 'calib.txt', '60.5', '0'),
     'calib.txt does not exist': lambda f: (f / 'calib.txt').unlink(),
     'times.txt does not exist': lambda f: (f / 'times.txt').unlink(),
@@ -147,15 +147,6 @@ def test_a_missing_folder_or_poses_file_is_refused(small_kitti, tmp_path):
         KittiSequence(tmp_path / 'nowhere')
     with pytest.raises(DjetError, match=r'absent.txt does not exist'):
         KittiSequence(small_kitti(), poses=tmp_path / 'absent.txt')
-
-
-def test_a_png_cut_short_is_found_when_it_is_read(small_kitti):
-    folder = small_kitti()
-    path = folder / 'image_0' / '000001.png'
-    path.write_bytes(path.read_bytes()[:1000])
-    sequence = KittiSequence(folder)
-    with pytest.raises(DjetError, match='000001.png is a damaged image'):
-        sequence.image(1)
 
 
 def test_a_png_that_declares_a_huge_size_is_not_decoded(small_kitti):

@@ -19,7 +19,7 @@ from djet_ros.odometry.messages import pose_of, stamp_ns
 from djet_ros.recordings.bag_writers import ResultBag, write_kitti_bag
 from djet_ros.recordings.bags import Bag
 from djet_ros.recordings.decoding import MAKE
-from djet_ros.recordings.frame_sequence import FrameSequence, ImageFiles
+from djet_ros.recordings.frame_sequence import FrameSequence, ImageFiles, Intrinsics
 from djet_ros.recordings.imu import ImuTrack
 from djet_ros.recordings.recording import BagRecording, IMU_TOPIC
 import numpy as np
@@ -151,8 +151,9 @@ def filmed(images: list[Any], folder: Path) -> FrameSequence:
         assert cv2.imwrite(str(path), pixels)
     felt = feel(np.array(WAY), PERIOD * 1e-9, Mems(), 0)
     return FrameSequence(
-        'cards', ImageFiles(paths), K, np.array([stamp(i) for i in range(len(images))]), None,
-        imu=ImuTrack(START + felt.stamps_ns, felt.rates, felt.accelerations, felt.to_camera))
+        'cards', ImageFiles(paths), Intrinsics(K),
+        np.array([stamp(i) for i in range(len(images))]), None,
+        ImuTrack(START + felt.stamps_ns, felt.rates, felt.accelerations, felt.to_camera))
 
 
 @pytest.mark.parametrize(('base_frame', 'imu'), [

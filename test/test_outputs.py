@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 import os
 from pathlib import Path
-import resource
 import stat
 
+from cards import filmed, pose
+from commands import full_disk
 from djet_ros.cli.main import main
 from djet_ros.config.sections import Config
 from djet_ros.errors import DjetError
@@ -26,17 +25,6 @@ class Count:
     """The plainest record."""
 
     number: int
-
-
-@contextmanager
-def full_disk() -> Iterator[None]:
-    """Let this process write no file beyond ten bytes, as on a full disk."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def held(folder: Path) -> dict[str, str]:
@@ -168,11 +156,13 @@ def test_figures_without_a_place_are_refused_before_they_are_measured(
 
 def test_figures_that_find_a_full_disk_are_named(
         tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    output = tmp_path / 'f.json'
+    output = tmp_path / 'results' / 'f.json'
+    sequence = filmed(tmp_path / 'sequences' / '00', [pose(x=0.25 * i) for i in range(3)])
     with full_disk():
-        assert main(['lab', 'soak', '--frames', '100', '--output', str(output)]) == 2
+        assert main(['lab', 'closure', str(sequence), '--methods', 'rpe', '--output',
+                     str(output)]) == 2
     assert capsys.readouterr().err.splitlines()[-1] == f'djet: error: {output}: File too large'
-    assert list(tmp_path.iterdir()) == []
+    assert list(output.parent.iterdir()) == []
 
 
 @pytest.mark.parametrize('text', [

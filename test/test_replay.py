@@ -1,6 +1,7 @@
 """``djet replay``: what it writes, and its error messages."""
 
 import csv
+from itertools import count
 import json
 import os
 from pathlib import Path
@@ -11,8 +12,8 @@ import subprocess
 import sys
 import time
 
-from cards import Cards, DEPTHS, K, pose, SIZE
-from commands import checked as djet
+from cards import Cards, DEPTHS, filmed, K, pose, SIZE
+from commands import alone, checked as djet, contents, DJET
 import cv2
 from djet_ros.config.flat import from_flat
 from djet_ros.config.sections import Config
@@ -20,7 +21,6 @@ from djet_ros.config.yaml_files import load_yaml
 from djet_ros.core.geometry import rotation_exp
 from djet_ros.core.types import Status
 from djet_ros.errors import DjetError
-from djet_ros.lab.scenes.sequence import render_sequence
 from djet_ros.odometry.camera import Camera
 from djet_ros.odometry.messages import OPTICAL_TO_BODY, pose_of
 from djet_ros.posegraph import recorded_frames
@@ -41,38 +41,19 @@ from djet_ros.replay.pair_errors import pair_errors, statistics
 from djet_ros.replay.results import ResultsFolder
 import numpy as np
 import pytest
-from ros_messages import camera_info, header, image, message_type, STORE
-from rosbags.rosbag2 import StoragePlugin, Writer
+from ros_messages import camera_info, header, image, message_type, record
+from rosbags.rosbag2 import Writer
 
-DJET = [sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; sys.exit(main())']
 FRAMES = 6
 STEP = pose(x=0.25, z=0.15, yaw=0.01)
+POSES = [np.linalg.matrix_power(STEP, i) for i in range(FRAMES)]
 SECOND = 10**9
-
-
-def djet_alone(*call, **settings):
-    """Run the command in a process of its own, with these variables of the environment."""
-    return subprocess.run([*DJET, *map(str, call)], capture_output=True, text=True, timeout=120,
-                          check=False, env={**os.environ, **settings})
 
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
     """Write a small KITTI sequence with ground truth, and return its folder."""
-    root = tmp_path_factory.mktemp('dataset')
-    sequence = root / 'sequences' / '00'
-    (sequence / 'image_0').mkdir(parents=True)
-    (root / 'poses').mkdir()
-    cards, here, rows = Cards(), np.eye(4), []
-    for i in range(FRAMES):
-        cv2.imwrite(str(sequence / 'image_0' / f'{i:06d}.png'), cards.gray(here))
-        rows.append(' '.join(repr(float(v)) for v in here[:3].ravel()))
-        here = here @ STEP
-    row = ' '.join(str(v) for v in np.hstack([K, np.zeros((3, 1))]).ravel())
-    (sequence / 'calib.txt').write_text(f'P0: {row}\n')
-    (sequence / 'times.txt').write_text(''.join(f'{0.1 * i:.6e}\n' for i in range(FRAMES)))
-    (root / 'poses' / '00.txt').write_text('\n'.join(rows) + '\n')
-    return sequence
+    return filmed(tmp_path_factory.mktemp('dataset') / 'sequences' / '00', POSES)
 
 
 @pytest.fixture(scope='module')
@@ -82,29 +63,29 @@ def bag(folder, tmp_path_factory):
     return path
 
 
-def record(path, messages):
-    """Write (topic, message, stamp) as a bag."""
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connections = {}
-        for topic, message, stamp in messages:
-            kind = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
-            writer.write(connections[topic], stamp, STORE.serialize_cdr(message, kind))
+def stamp_at(frame):
+    """Return the stamp of a frame of the drive."""
+    return SECOND + frame * SECOND // 10
+
+
+def true_poses(path, stamp=stamp_at):
+    """Write the poses of the drive, with the stamp of each frame, as a TUM file."""
+    with TumWriter(path) as truth:
+        for i, here in enumerate(POSES):
+            truth.write(stamp(i), here)
     return path
 
 
 def drive(change=lambda i, message: message, info=True):
     """Yield the messages of a drive; change makes another message of an image (or None)."""
-    cards, here = Cards(), np.eye(4)
-    for i in range(FRAMES):
-        stamp = SECOND + i * SECOND // 10
+    cards = Cards()
+    for i, here in enumerate(POSES):
+        stamp = stamp_at(i)
         if info:
             yield INFO_TOPIC, camera_info(K, SIZE, stamp), stamp
         message = change(i, image(cards.gray(here), stamp_ns=stamp))
         if message is not None:
             yield IMAGE_TOPIC, message, stamp
-        here = here @ STEP
 
 
 def summary(results):
@@ -126,7 +107,7 @@ def test_keyframe_images_have_the_masks_of_the_odometry(tmp_path):
                         auxiliary={'mask': None}) as recording:
         frame_at = frame_finder(recording, config)
         for i in (0, 1, 3, 5):
-            left_out = frame_at(SECOND + i * SECOND // 10).left_out
+            left_out = frame_at(stamp_at(i)).left_out
             assert left_out is None if i == 3 else left_out[0].sum() == 10 + i
 
 
@@ -208,8 +189,7 @@ def test_tf_of_a_recording_gives_the_lengths_through_moving_frames(tmp_path):
     djet('replay', path, '--output', tmp_path / 'out', *call)
     assert summary(tmp_path / 'out')['pairs_of_known_scale'] == FRAMES - 1
     _, camera = read_tum(tmp_path / 'out' / 'trajectory_tum.txt')
-    true = [np.linalg.matrix_power(STEP, i)[:3, 3] for i in range(FRAMES)]
-    assert np.allclose(camera[:, :3, 3], true, atol=0.02)
+    assert np.allclose(camera[:, :3, 3], [here[:3, 3] for here in POSES], atol=0.02)
     without = djet('replay', record(tmp_path / 'none', drive()), '--output', tmp_path / 'no',
                    *call, expect=2)
     assert 'has no topic /tf, which odometry.guess_frame requires' in without.stderr
@@ -226,14 +206,24 @@ def test_missing_mounting_in_a_recording_is_one_line(tmp_path, folder):
         assert not (tmp_path / f'of_{source.name}').exists()
 
 
-def test_sequence_with_an_imu_gives_the_odometry_of_the_imu(tmp_path):
-    folder = render_sequence('road', tmp_path, 4, size=(480, 160))
-    call = ('replay', folder, '--output', tmp_path / 'out', '--base-frame', 'imu')
+def with_imu(folder, tmp_path):
+    """Copy the sequence, and add a gyro at 100 Hz that turns as the camera does."""
+    copy = Path(shutil.copytree(folder, tmp_path / '01'))
+    with (copy / 'calib.txt').open('a') as calibration:
+        calibration.write('Tr_imu_to_cam: 1 0 0 0 0 1 0 0 0 0 1 0\n')
+    (copy / 'imu.csv').write_text(''.join(
+        f'{i * SECOND // 100},0,0.1,0,0,-9.8,0\n' for i in range(10 * FRAMES)))
+    return copy
+
+
+def test_sequence_with_an_imu_gives_the_odometry_of_the_imu(folder, tmp_path):
+    call = ('replay', with_imu(folder, tmp_path), '--output', tmp_path / 'out', '--base-frame',
+            'imu')
     assert "has no transform from it to 'camera'" in djet(*call, expect=2).stderr
     djet(*call, '--imu', 'true')
     with Bag(tmp_path / 'out' / 'bag') as result:
         published = [one.message for one in result.messages({'/vo_node/odometry'})]
-    assert [message.child_frame_id for message in published] == ['imu'] * 4
+    assert [message.child_frame_id for message in published] == ['imu'] * FRAMES
 
 
 def test_missing_mounting_keeps_earlier_results(tmp_path):
@@ -528,11 +518,10 @@ def test_only_results_are_overwritten_and_only_on_request(bag, replayed, tmp_pat
 def test_a_folder_to_which_another_replay_still_writes_is_refused(tmp_path):
     results = tmp_path / 'results'
     with ResultsFolder(results, Config()):
-        before = {path: path.read_bytes() for path in results.rglob('*') if path.is_file()}
+        before = contents(results)
         with pytest.raises(DjetError, match='written to by another replay, which still runs'):
             ResultsFolder(results, from_flat({'preset': 'fast'}), overwrite=True)
-        assert before == {
-            path: path.read_bytes() for path in results.rglob('*') if path.is_file()}
+        assert contents(results) == before
     with ResultsFolder(results, from_flat({'preset': 'fast'}), overwrite=True):
         assert load_yaml(results / 'config.yaml').preset == 'fast'
 
@@ -543,24 +532,24 @@ def test_a_folder_to_which_another_replay_still_writes_is_refused(tmp_path):
 def test_a_mistake_in_the_command_costs_no_earlier_results(mistake, bag, replayed, tmp_path):
     results = tmp_path / 'results'
     shutil.copytree(replayed[0], results)
-    before = {path: path.read_bytes() for path in results.rglob('*') if path.is_file()}
+    before = contents(results)
     source, *call = mistake
     printed = djet('replay', bag if source == 'bag' else tmp_path / source, *call, '--output',
                    results, '--overwrite', expect=2).stderr
     assert printed.count('\n') == 1
-    assert {path: path.read_bytes() for path in results.rglob('*') if path.is_file()} == before
+    assert contents(results) == before
 
 
 def test_images_of_which_none_can_be_used_cost_no_earlier_results(folder, replayed, tmp_path):
     results = tmp_path / 'results'
     shutil.copytree(replayed[0], results)
-    before = {path: path.read_bytes() for path in results.rglob('*') if path.is_file()}
+    before = contents(results)
     shutil.copytree(folder, tmp_path / '00')
     for path in (tmp_path / '00' / 'image_0').iterdir():
         path.write_bytes(path.read_bytes()[:500])
     printed = djet('replay', tmp_path / '00', '--output', results, '--overwrite', expect=2).stderr
     assert f'none of {FRAMES} images could be used' in printed
-    assert {path: path.read_bytes() for path in results.rglob('*') if path.is_file()} == before
+    assert contents(results) == before
     djet('replay', folder, '--output', results, '--overwrite', '--preset', 'paper')
     assert summary(results)['preset'] == 'paper'
     assert not list(results.glob('.*'))
@@ -568,8 +557,8 @@ def test_images_of_which_none_can_be_used_cost_no_earlier_results(folder, replay
 
 @pytest.mark.slow
 def test_results_are_utf_8_whatever_the_locale_is(bag, tmp_path):
-    done = djet_alone('replay', bag, '--output', tmp_path / 'out', LC_ALL='C', PYTHONUTF8='0',
-                      PYTHONCOERCECLOCALE='0')
+    done = alone('replay', bag, '--output', tmp_path / 'out', LC_ALL='C', PYTHONUTF8='0',
+                 PYTHONCOERCECLOCALE='0')
     assert (done.returncode, done.stderr) == (0, '')
     assert 'rad/s²' in (tmp_path / 'out' / 'config.yaml').read_text('utf-8')
     assert load_yaml(tmp_path / 'out' / 'config.yaml') == Config()
@@ -649,7 +638,8 @@ def bad_config(tmp_path, bag):
     (lambda t, b: [b, '--scale', 'speed'], 'speed'),
     (lambda t, b: [b, '--scale', 'camera_height'], 'give the metres from the ground'),
     (lambda t, b: [b, '--scale', 'constant'], 'scale_value is 0; give the metres of each'),
-    (lambda t, b: [b, '--image-topic', '/other'], "'/other'"),
+    (lambda t, b: [b, '--image-topic', '/other'], "no image topic '/other'"),
+    (lambda t, b: [b, '--info-topic', '/other'], "no CameraInfo topic '/other'"),
     (lambda t, b: [b, '--imu', 'true', '--imu-topic', '/other'], "no topic '/other' for 'imu'"),
     *[(lambda t, b, what=what: [b, f'--{what}-topic', '/some'],
        f"--{what}-topic is '/some', but the configuration does not use it; set odometry.")
@@ -707,22 +697,11 @@ def test_a_file_may_have_parameters_that_only_some_scales_use(bag, tmp_path):
     assert summary(tmp_path / 'out')['scale_kind'] == 'relative'
 
 
-def seen(tmp_path, frames):
-    """Return a recording of images (H, W) with the true poses of the drive."""
-    poses = tmp_path / 'poses.txt'
-    with TumWriter(poses) as truth:
-        for i in range(len(frames)):
-            truth.write(SECOND + i * SECOND // 10, np.linalg.matrix_power(STEP, i))
-    messages = [(topic, message, stamp) for i, gray in enumerate(frames)
-                for stamp in [SECOND + i * SECOND // 10]
-                for topic, message in [(INFO_TOPIC, camera_info(K, SIZE, stamp)),
-                                       (IMAGE_TOPIC, image(gray, stamp_ns=stamp))]]
-    return record(tmp_path / 'bag', messages), poses
-
-
 def test_recording_without_tracked_pairs_gives_a_warning(tmp_path):
-    source, poses = seen(tmp_path, [np.zeros(SIZE[::-1], np.uint8)] * FRAMES)
-    done = djet('replay', source, '--poses', poses, '--output', tmp_path / 'out')
+    source = record(tmp_path / 'bag', drive(
+        lambda i, message: image(np.zeros(SIZE[::-1], np.uint8), stamp_ns=stamp_at(i))))
+    done = djet('replay', source, '--poses', true_poses(tmp_path / 'poses.txt'), '--output',
+                tmp_path / 'out')
     assert (f'djet: warning: none of {FRAMES - 1} pairs could be tracked (mostly '
             'TOO_FEW_MATCHES): the images are dark') in done.stderr
     assert 'positions' not in done.stdout
@@ -734,7 +713,7 @@ def test_recording_without_tracked_pairs_gives_a_warning(tmp_path):
 
 
 def test_a_recording_of_one_image_gives_a_warning(tmp_path):
-    source, _ = seen(tmp_path, [Cards().gray(np.eye(4))])
+    source = record(tmp_path / 'bag', drive(lambda i, message: None if i else message))
     done = djet('replay', source, '--output', tmp_path / 'out')
     assert done.stderr == ('djet: warning: only one image was used, so no motion was estimated: '
                            'that takes two images\n')
@@ -742,7 +721,8 @@ def test_a_recording_of_one_image_gives_a_warning(tmp_path):
 
 @pytest.mark.slow
 def test_stationary_camera_gives_a_warning(tmp_path):
-    source, _ = seen(tmp_path, [Cards().gray(np.eye(4))] * FRAMES)
+    source = record(tmp_path / 'bag', drive(
+        lambda i, message: image(Cards().gray(), stamp_ns=stamp_at(i))))
     done = djet('replay', source, '--output', tmp_path / 'out')
     assert (f'djet: warning: all {FRAMES - 1} pairs have no parallax (NO_PARALLAX): the camera '
             'was stationary or only rotated') in done.stderr
@@ -775,13 +755,8 @@ def test_images_beyond_max_gap_give_a_warning(tmp_path, bag):
 
 
 def test_12_bit_camera_gives_a_warning_that_gray_range_resolves(tmp_path):
-    cards = Cards()
-    frames = [cards.gray(np.linalg.matrix_power(STEP, i)).astype('<u2') * 4 for i in range(FRAMES)]
-    source = record(tmp_path / 'bag', [
-        (topic, message, SECOND + i * SECOND // 10) for i, values in enumerate(frames)
-        for topic, message in [
-            (INFO_TOPIC, camera_info(K, SIZE, SECOND + i * SECOND // 10)),
-            (IMAGE_TOPIC, image(values, 'mono16', SECOND + i * SECOND // 10))]])
+    source = record(tmp_path / 'bag', drive(lambda i, message: image(
+        message.data.reshape(SIZE[::-1]).astype('<u2') * 4, 'mono16', stamp_at(i))))
     done = djet('replay', source, '--output', tmp_path / 'dark')
     assert 'djet: warning: few gray levels: ' in done.stderr
     done = djet('replay', source, '--gray-range', '0 1023', '--output', tmp_path / 'stretched')
@@ -809,11 +784,10 @@ def test_truncated_bag_is_used_up_to_the_cut(bag, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize('damage, reason, frames', [
-    (lambda i, m: image(np.zeros((100, 100), np.uint8), stamp_ns=SECOND + i * SECOND // 10)
-     if i == 3 else m, 'size_mismatch', FRAMES - 1),
-    (lambda i, m: image(np.zeros((240, 320), np.uint8), height=999,
-                        stamp_ns=SECOND + i * SECOND // 10) if i in (2, 4) else m,
-     'size_mismatch|short_data', FRAMES - 2)])
+    (lambda i, m: image(np.zeros((100, 100), np.uint8), stamp_ns=stamp_at(i)) if i == 3 else m,
+     'size_mismatch', FRAMES - 1),
+    (lambda i, m: image(np.zeros((240, 320), np.uint8), height=999, stamp_ns=stamp_at(i))
+     if i in (2, 4) else m, 'size_mismatch|short_data', FRAMES - 2)])
 def test_bad_image_is_named_and_the_rest_is_tracked(
         damage, reason, frames, tmp_path):
     results = tmp_path / 'results'
@@ -885,7 +859,7 @@ def test_zero_camera_info_loses_the_images_up_to_the_next_one(at, tmp_path):
     assert sum(found['rejected_infos'].values()) == 1
     # A second pass over the recording has the cameras of the odometry.
     with open_recording(path) as recording:
-        frame = frame_finder(recording, Config())(SECOND + 5 * SECOND // 10)
+        frame = frame_finder(recording, Config())(stamp_at(5))
     assert frame.gray.shape == SIZE[::-1]
 
 
@@ -990,14 +964,9 @@ def test_constant_stamps_give_a_warning(goes_on, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize('sign, code', [
-    (signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGKILL, -9)])
-def test_interrupted_run_is_readable_and_marked_incomplete(folder, tmp_path, sign, code):
-    endless = tmp_path / 'sequences' / '01'
-    shutil.copytree(folder, endless)
-    for i in range(FRAMES, 2000):
-        os.symlink(endless / 'image_0' / f'{i % FRAMES:06d}.png',
-                   endless / 'image_0' / f'{i:06d}.png')
-    (endless / 'times.txt').write_text(''.join(f'{0.1 * i:.6e}\n' for i in range(2000)))
+    (signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_interrupted_run_is_readable_and_marked_incomplete(tmp_path, sign, code):
+    endless = filmed(tmp_path / 'sequences' / '01', POSES, 2000)
     results = tmp_path / 'results'
     process = subprocess.Popen([*DJET, 'replay', endless, '--output', results],
                                stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
@@ -1012,48 +981,40 @@ def test_interrupted_run_is_readable_and_marked_incomplete(folder, tmp_path, sig
     found = summary(results)
     assert found['complete'] is False
     assert (found['source'], found['image_topic']) == (str(endless), IMAGE_TOPIC)
-    assert ('images' in found) == (results / 'bag' / 'metadata.yaml').exists() == (code > 0)
-    poses = [line for line in trajectory.read_text().splitlines() if len(line.split()) == 8]
-    assert len(poses) > 5
-    found = []
+    assert 'images' in found
+    assert len(trajectory.read_text().splitlines()) > 5
+    assert (results / 'bag' / 'metadata.yaml').exists()
     with Bag(results / 'bag') as out:
-        try:
-            found += out.messages({'/vo_node/odometry'})
-        except DjetError:
-            assert code == -9
-    assert sign == signal.SIGKILL or len(found) >= 5
+        assert len(list(out.messages({'/vo_node/odometry'}))) > 5
 
 
-@pytest.mark.slow
-def test_a_signal_within_a_write_waits_until_the_frame_is_in_all_results(folder, tmp_path):
+@pytest.mark.parametrize('place', range(1, 11, 3))
+def test_a_signal_within_a_write_waits_until_the_frame_is_in_all_results(
+        place, folder, tmp_path, monkeypatch):
     """The signal comes at several places within what rosbags writes of a frame."""
-    within = """
-import signal, sys
-from djet_ros.cli.main import main
-left, records = int(sys.argv.pop(1)), 0
-def watch(frame, event, _):
-    global left, records
-    if event != 'call' or 'rosbags' not in frame.f_code.co_filename:
-        return
-    records += frame.f_code.co_name == 'write' and frame.f_code.co_filename.endswith('/writer.py')
-    if records > 8:
-        left -= 1
-        if not left:
-            sys.setprofile(None)
-            signal.raise_signal(signal.SIGTERM)
-sys.setprofile(watch)
-sys.exit(main())
-"""
-    for place in range(1, 11, 3):
-        results = tmp_path / str(place)
-        ended = subprocess.run([sys.executable, '-c', within, str(place), 'replay', folder,
-                                '--output', results], capture_output=True, text=True, check=False)
-        assert ended.returncode == 143, ended.stderr
-        with Bag(results / 'bag') as out:
-            written = list(out.messages({'/vo_node/odometry'}))
-        poses = (results / 'trajectory_tum.txt').read_text().splitlines()
-        rows = (results / 'frames.csv').read_text().splitlines()[1:]
-        assert 0 < len(written) == len(poses) == len(rows) < FRAMES
+    records, write, left = count(1), Writer.write, place
+
+    def watch(frame, event, _):
+        nonlocal left
+        if event == 'call' and 'rosbags' in frame.f_code.co_filename:
+            left -= 1
+            if not left:
+                sys.setprofile(None)
+                signal.raise_signal(signal.SIGTERM)
+
+    def watched(*arguments):
+        if next(records) == 9:
+            sys.setprofile(watch)
+        write(*arguments)
+
+    monkeypatch.setattr(Writer, 'write', watched)
+    results = tmp_path / 'results'
+    djet('replay', folder, '--output', results, expect=143)
+    with Bag(results / 'bag') as out:
+        written = list(out.messages({'/vo_node/odometry'}))
+    poses = (results / 'trajectory_tum.txt').read_text().splitlines()
+    rows = (results / 'frames.csv').read_text().splitlines()[1:]
+    assert 0 < len(written) == len(poses) == len(rows) < FRAMES
 
 
 # Sources of ground truth
@@ -1081,10 +1042,7 @@ def test_poses_of_a_file_replace_those_of_the_bag(bag, folder, tmp_path):
     (0.95, 0.2, 'no errors were computed: no image lies between two poses of {} that are at most '
      '0.1 s apart; give ground truth with a higher rate')])
 def test_ground_truth_of_another_time_gives_a_warning(first, apart, why, tmp_path):
-    poses = tmp_path / 'poses.txt'
-    with TumWriter(poses) as truth:
-        for i in range(FRAMES):
-            truth.write(round((first + i * apart) * SECOND), np.linalg.matrix_power(STEP, i))
+    poses = true_poses(tmp_path / 'poses.txt', lambda i: round((first + i * apart) * SECOND))
     printed = djet('replay', record(tmp_path / 'bag', drive()), '--poses', poses, '--output',
                    tmp_path / 'r').stderr
     assert printed == f'djet: warning: {why.format(poses)}\n'
@@ -1103,8 +1061,8 @@ def test_several_ground_truths_are_named_with_a_remedy(bag, tmp_path):
             'camera as a file (--poses)\n')
     done = djet('replay', twice, '--output', tmp_path / 'out')
     assert done.stderr == f'djet: warning: no errors were computed: {both}'
-    answer = djet_alone('replay', twice, '--output', tmp_path / 'no', '--scale', 'ground_truth')
-    assert answer.returncode == 2
+    answer = djet('replay', twice, '--output', tmp_path / 'no', '--scale', 'ground_truth',
+                  expect=2)
     assert answer.stderr.endswith(f"odometry.scale is 'ground_truth', but {both}")
 
 
@@ -1117,9 +1075,9 @@ def test_a_ground_truth_that_is_not_of_the_camera_gives_a_warning(child, warned,
              for name in ('TransformStamped', 'Transform', 'Vector3')}
 
     def truth():
-        for i in range(FRAMES):
-            stamp = SECOND + i * SECOND // 10
-            stamped = MAKE.pose_in(stamp, 'world', np.linalg.matrix_power(STEP, i))
+        for i, here in enumerate(POSES):
+            stamp = stamp_at(i)
+            stamped = MAKE.pose_in(stamp, 'world', here)
             at = stamped.pose.position
             yield '/ground_truth/state', kinds['TransformStamped'](
                 stamped.header, child, kinds['Transform'](
@@ -1182,10 +1140,7 @@ def test_a_speed_topic_gives_metres(tmp_path):
 @pytest.mark.slow
 def test_metric_scale_without_measurements_gives_a_warning(tmp_path):
     source = record(tmp_path / 'bag', with_speeds(late=3600))
-    poses = tmp_path / 'another_day.txt'
-    with TumWriter(poses) as truth:
-        for i in range(FRAMES):
-            truth.write((5000 + i) * SECOND, np.linalg.matrix_power(STEP, i))
+    poses = true_poses(tmp_path / 'another_day.txt', lambda i: (5000 + i) * SECOND)
     for call, why in (
             (('speed',), 'the newest speed is stamped 3600.0 s after the newest image; give speeds'
              ' that are stamped by the clock of the images'),
@@ -1275,18 +1230,10 @@ def test_real_frames_are_replayed_within_a_degree(kitti, tmp_path):
     assert found['translation_error_deg']['max'] < 2
 
 
-def test_documented_command_is_valid():
-    parsed = djet('replay', '--help').stdout
-    for flag in ('--output', '--method', '--preset', '--overwrite', '--config', '--image-topic',
-                 '--info-topic', '--poses', '--scale'):
-        assert flag in parsed
-
-
-@pytest.mark.slow
-def test_unused_auxiliary_inputs_give_a_warning(tmp_path):
-    folder = render_sequence('road', tmp_path, 8, size=(480, 160))
+def test_unused_auxiliary_inputs_give_a_warning(folder, tmp_path):
+    source = with_imu(folder, tmp_path)
     for enough in (False, True):
         if enough:
-            (folder / 'imu.csv').write_text('')
-        run = djet('replay', folder, '--imu', 'true', '--overwrite', '--output', tmp_path / 'out')
+            (source / 'imu.csv').write_text('')
+        run = djet('replay', source, '--imu', 'true', '--overwrite', '--output', tmp_path / 'out')
         assert ('djet: warning: no imu in time: ' in run.stderr) is enough

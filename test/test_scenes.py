@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-import subprocess
-import sys
 
+from commands import alone
 import cv2
 from djet_ros.errors import DjetError
 from djet_ros.lab.scenes import make_scene, render_pair, render_sequence, Scene, ScenePair, SCENES
@@ -23,7 +22,6 @@ pytestmark = pytest.mark.slow
 
 SMALL = (620, 188)
 TINY = (160, 64)
-DJET = 'import sys; from djet_ros.cli.main import main; sys.exit(main())'
 
 
 def clean(scene: Scene) -> Scene:
@@ -250,9 +248,8 @@ def test_an_impossible_scene_is_refused_in_one_line(
 
 
 def test_the_command_writes_the_same_bytes_in_another_process(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, '-c', DJET, 'lab', 'render', 'repeated_texture', tmp_path / 'a',
-         '--frames', '2', '--size', '160x64'], capture_output=True, text=True, check=True)
+    done = alone('lab', 'render', 'repeated_texture', tmp_path / 'a', '--frames', 2, '--size',
+                 '160x64')
     folder = render_sequence('repeated_texture', tmp_path / 'b', 2, size=TINY)
     other = tmp_path / 'a' / folder.relative_to(tmp_path / 'b')
     assert done.stdout == f'{other}: 2 frames of 160x64 with ground truth\n'

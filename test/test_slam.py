@@ -6,7 +6,7 @@ import resource
 import shutil
 import tracemalloc
 
-from cards import Cards, K, pose
+from cards import Cards, filmed, K, pose
 from commands import checked as djet
 import cv2
 from djet_ros.config.sections import Config, SlamConfig
@@ -756,20 +756,9 @@ def without_evo():
 def drive(tmp_path_factory):
     """Return a KITTI sequence of a path to the right and back, past cards."""
     pytest.importorskip('gtsam', reason='GTSAM is not installed: the extra slam')
-    folder = tmp_path_factory.mktemp('dataset') / 'sequences' / '00'
-    (folder / 'image_0').mkdir(parents=True)
-    (folder.parents[1] / 'poses').mkdir()
-    cards, rows = Cards(), []
     positions = [0.25 * i for i in (*range(8), *range(8, -1, -1))]
-    for i, metres in enumerate(positions):
-        here = pose(x=metres, z=0.3 * metres**2)
-        cv2.imwrite(str(folder / 'image_0' / f'{i:06d}.png'), cards.gray(here, noise=i))
-        rows.append(' '.join(repr(float(v)) for v in here[:3].ravel()))
-    row = ' '.join(str(v) for v in np.hstack([K, np.zeros((3, 1))]).ravel())
-    (folder / 'calib.txt').write_text(f'P0: {row}\n')
-    (folder / 'times.txt').write_text(''.join(f'{0.1 * i:.6e}\n' for i in range(len(positions))))
-    (folder.parents[1] / 'poses' / '00.txt').write_text('\n'.join(rows) + '\n')
-    return folder
+    return filmed(tmp_path_factory.mktemp('dataset') / 'sequences' / '00',
+                  [pose(x=metres, z=0.3 * metres**2) for metres in positions], noise=True)
 
 
 FLAGS = ('--keyframes', 'distance', '--keyframe-distance', 0.5, '--loop-gap', 0.5)

@@ -7,11 +7,9 @@ import json
 from mmap import mmap, PAGESIZE
 import multiprocessing
 from pathlib import Path
-import subprocess
-import sys
 from typing import Any
 
-from commands import djet
+from commands import alone, djet
 from covariances import check_messages
 from djet_ros.config.sections import OdometryConfig
 from djet_ros.core.estimator_config import EstimatorConfig
@@ -27,15 +25,9 @@ pytestmark = pytest.mark.slow
 FRAMES = 100
 
 
-def djet_soak(*arguments: object) -> subprocess.CompletedProcess[str]:
-    code = 'import sys; from djet_ros.cli.main import main; sys.exit(main())'
-    return subprocess.run([sys.executable, '-c', code, 'lab', 'soak', *map(str, arguments)],
-                          capture_output=True, text=True, timeout=300, check=False)
-
-
 def test_memory_and_latency_are_recorded_and_memory_does_not_grow(tmp_path: Path) -> None:
     output = tmp_path / 'deep' / 'soak.json'
-    run = djet_soak('--output', output, '--frames', FRAMES)
+    run = alone('lab', 'soak', '--output', output, '--frames', FRAMES)
     assert run.returncode == 0, run.stderr
     assert 'passed' in run.stdout
     figures = json.loads(output.read_text())

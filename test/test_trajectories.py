@@ -1,11 +1,11 @@
 """Trajectory files: exact, and never lost."""
 
 import os
-import resource
 import signal
 import subprocess
 import sys
 
+from commands import full_disk
 from djet_ros.errors import DjetError
 from djet_ros.recordings.kitti import read_poses
 from djet_ros.recordings.trajectories import KittiWriter, read_tum, TumWriter
@@ -110,18 +110,14 @@ def test_a_wrong_tum_line_is_named(tmp_path, line, message):
 
 
 def test_a_line_without_room_on_the_disk_is_removed(tmp_path):
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     with TumWriter(tmp_path / 'full.txt') as writer:
         for i in range(20):
             writer.write(i, np.eye(4))
         whole = (tmp_path / 'full.txt').read_bytes()
-        resource.setrlimit(resource.RLIMIT_FSIZE, (len(whole) + 7, limits[1]))
-        try:
+        with full_disk(len(whole) + 7):
             for _ in range(2):
                 with pytest.raises(DjetError, match='the poses written so far are complete'):
                     writer.write(20, np.eye(4))
                 assert (tmp_path / 'full.txt').read_bytes() == whole
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         writer.write(20, np.eye(4))
     assert len(read_tum(tmp_path / 'full.txt')[0]) == 21

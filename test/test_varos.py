@@ -67,7 +67,7 @@ def test_truth_is_found_at_stamps_of_more_digits_than_a_double_has(varos):
 def test_a_missing_stamp_is_named(varos):
     file = varos / 'vehicle0' / 'cam0' / 'camM0_timestamps.csv'
     file.write_text(file.read_text().rpartition('205000000')[0])
-    with pytest.raises(DjetError, match='camM0_timestamps.csv has 2 rows for 3 images'):
+    with pytest.raises(DjetError, match='camM0_timestamps.csv has 2 lines for 3 images'):
         open_sequence(varos)
 
 

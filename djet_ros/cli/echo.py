@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 import sys
-from threading import Event
 from time import monotonic
 from typing import Any
 
@@ -59,32 +59,36 @@ def run(args: argparse.Namespace) -> int:
     namespace, _, node = args.node.strip('/').rpartition('/')
     names = Names(node, [*args.remap, *([f'__ns:=/{namespace}'] if namespace else [])])
     view, topic = Monitor(names.full_node.strip('/')), names.resolve('~/odometry')
+    out = terminal.console()
+    as_table = args.diagnostics and out.is_terminal
 
     def pose(message: Any) -> None:
         view.odometry(message)
         if not args.diagnostics:
             _print_pose(message)
 
-    with Graph() as graph:
+    def diagnostics(message: Any) -> None:
+        if view.diagnostics(message) and not as_table:
+            print(view.line(), flush=True)
+
+    with Graph() as graph, (Live(view.table(), console=out, auto_refresh=False) if as_table
+                            else nullcontext()) as live:
         graph.listen(topic, _ODOMETRY, pose)
-        silence = _SilenceWarning(view, graph, topic)
         if args.diagnostics:
             graph.listen(names.resolve('/diagnostics'), 'diagnostic_msgs/msg/DiagnosticArray',
-                         view.diagnostics)
-            _show(view, graph, stop, silence)
+                         diagnostics)
+        silence = _SilenceWarning(view, graph, topic)
         while not stop.is_set():
-            graph.spin(0.1)
+            graph.spin(0.2)
             silence.check()
+            if live is not None:
+                live.update(view.table(), refresh=True)
     return 0
 
 
 @dataclass
 class Monitor:
-    """
-    State of the odometry, from its messages so far.
-
-    updated: whether diagnostics have arrived since they were last printed.
-    """
+    """State of the odometry, from its messages so far."""
 
     node: str
     path_length: float = 0.0
@@ -92,7 +96,6 @@ class Monitor:
     summary: str = 'no diagnostics received yet'
     level: int = 3
     values: dict[str, str] = field(default_factory=dict)
-    updated: bool = False
     _last: Any = None
 
     def odometry(self, message: Any) -> None:
@@ -106,13 +109,14 @@ class Monitor:
             self.path_length += float(np.linalg.norm(position - self._last))
         self._last = position
 
-    def diagnostics(self, message: Any) -> None:
-        """Update the state, if the message has the status of this node."""
+    def diagnostics(self, message: Any) -> bool:
+        """Update the state, and return True, if the message has the status of this node."""
         for status in message.status:
             if status.name == f'{self.node}: visual odometry':
                 self.values = {pair.key: pair.value for pair in status.values}
-                self.summary, self.updated = status.message, True
-                self.level = int(status.level)
+                self.summary, self.level = status.message, int(status.level)
+                return True
+        return False
 
     @property
     def length(self) -> str:
@@ -162,21 +166,3 @@ def _print_pose(message: Any) -> None:
     p, q = pose.position, pose.orientation
     print(f'{stamp.sec}.{stamp.nanosec:09d} {p.x:.6f} {p.y:.6f} {p.z:.6f} '
           f'{q.x:.6f} {q.y:.6f} {q.z:.6f} {q.w:.6f}', flush=True)
-
-
-def _show(view: Monitor, graph: Any, stop: Event, silence: _SilenceWarning) -> None:
-    """Update a table in a terminal, else print a line for each diagnostics message."""
-    console = terminal.console()
-    if console.is_terminal:
-        with Live(view.table(), console=console, auto_refresh=False) as live:
-            while not stop.is_set():
-                graph.spin(0.2)
-                silence.check()
-                live.update(view.table(), refresh=True)
-        return
-    while not stop.is_set():
-        graph.spin(0.2)
-        silence.check()
-        if view.updated:
-            view.updated = False
-            print(view.line(), flush=True)

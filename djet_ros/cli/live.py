@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -47,8 +48,9 @@ def run(args: argparse.Namespace) -> int:
 
 def _configuration(args: argparse.Namespace, node: str) -> tuple[Config, bool]:
     """Return (configuration, use_sim_time) from file and command line; node: its full name."""
-    config = Config() if args.params is None else load_yaml(
-        args.params, take=with_live_values, nodes=[node])
+    config = Config()
+    if args.params is not None:
+        config = load_yaml(args.params, partial(with_live_values, config), [node])
     known = flat(config)
     values: dict[str, Any] = {}
     use_sim_time = False

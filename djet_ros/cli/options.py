@@ -143,7 +143,7 @@ def _seeds(text: str) -> list[int]:
         ends = [[int(end) for end in part.split('-', 1)] for part in split(text)]
     except ValueError:
         ends = []
-    if sum(end[-1] - end[0] + 1 for end in ends) > _MOST_SEEDS:
+    if sum(max(end[-1] - end[0] + 1, 0) for end in ends) > _MOST_SEEDS:
         raise argparse.ArgumentTypeError(f"'{text}' has more than {_MOST_SEEDS} seeds")
     seeds = [seed for end in ends for seed in range(end[0], end[-1] + 1)]
     if not seeds or any(end[0] > end[-1] for end in ends) or len(set(seeds)) < len(seeds):

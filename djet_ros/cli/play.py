@@ -43,20 +43,16 @@ def run(args: argparse.Namespace) -> int:
     from djet_ros.dds.names import Names
     from djet_ros.dds.player import Player
     names = Names('player', args.remap)
-    source = open_recording(args.source, args.image_topic, args.info_topic,
-                            auxiliary=dict.fromkeys(AUXILIARY), strict=False)
-    try:
-        with Graph() as graph:
-            player = Player(graph, source, names, args.rate, args.clock)
-            print(f'waiting for a subscriber to {player.image_topic}', file=sys.stderr,
-                  flush=True)
-            player.wait_for_listener(stop)
-            while not stop.is_set():
-                player.play(stop)
-                if not args.loop:
-                    break
-    finally:
-        source.close()
+    with open_recording(args.source, args.image_topic, args.info_topic,
+                        auxiliary=dict.fromkeys(AUXILIARY), strict=False) as source, \
+            Graph() as graph:
+        player = Player(graph, source, names, args.rate, args.clock)
+        print(f'waiting for a subscriber to {player.image_topic}', file=sys.stderr, flush=True)
+        player.wait_for_listener(stop)
+        while not stop.is_set():
+            player.play(stop)
+            if not args.loop:
+                break
     late = f', the last {player.late:.1f} s late' if player.late > 0.1 else ''
     print(f'{player.images} images published on {player.image_topic}{late}')
     return 0

@@ -109,8 +109,7 @@ def configuration(args: argparse.Namespace, *nodes: str, base: Config | None = N
     """
     config = base or Config()
     if args.config:
-        config = load_yaml(args.config, lambda _, values: with_values(config, values),
-                           nodes or (NODE_NAME,))
+        config = load_yaml(args.config, partial(with_values, config), nodes or (NODE_NAME,))
     return with_values(config, flag_values(args))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -58,32 +59,15 @@ def run(args: argparse.Namespace) -> int:
     from djet_ros.lab.slam_report import FILES, PLOT, write_report
     from djet_ros.posegraph.offline import run_slam
     check_room(args.output, FILES, args.overwrite)
-    results = args.input
-    if (results / 'frames.csv').is_file():
-        config = _with_loop_parameters(args, results)
-    else:
-        config = configuration(args, NODE_NAME, GRAPH_NAME)
-        results = args.output / 'replay'
-        # Earlier results of slam would not belong to the new replay.
-        with opened_replay(args, config, args.input, results,
-                           derived=[args.output / name for name in FILES]) as replay:
-            outcome = replay()
-        for line in outcome.advice:
-            warn(line)
-        if outcome.problem and not outcome.summary['frames']:
-            raise DjetError(outcome.problem)
-        if outcome.problem:
-            # As of results: what could be replayed is used.
-            warn(outcome.problem)
+    # Earlier results of slam would not belong to a new replay.
+    results, config = _replayed(args, derived=[args.output / name for name in FILES])
     source, name = _source(results, args, config)
-    try:
+    with source:
         steps = read_steps(results, warn)
         make_folder(args.output)
         with progress_bar('frames') as progress:
             slam = run_slam(steps, source, config, progress, args.output)
         truth = GroundTruth.of(source, warn).at(slam.frames.stamps_ns)
-    finally:
-        source.close()
     with replaced_together(args.output, FILES, args.overwrite) as new:
         summary = write_report(new, slam, truth, name, config)
     console().print(_table(summary))
@@ -92,6 +76,23 @@ def run(args: argparse.Namespace) -> int:
               'not have its landmarks')
     print(f'results: {args.output}\nplot: {args.output / PLOT}')
     return 0
+
+
+def _replayed(args: argparse.Namespace, derived: Iterable[Path]) -> tuple[Path, Config]:
+    """Return the results to use and their parameters; replay the input if it is a recording."""
+    if (args.input / 'frames.csv').is_file():
+        return args.input, _with_loop_parameters(args, args.input)
+    config, results = configuration(args, NODE_NAME, GRAPH_NAME), args.output / 'replay'
+    with opened_replay(args, config, args.input, results, derived=derived) as replay:
+        outcome = replay()
+    for line in outcome.advice:
+        warn(line)
+    if outcome.problem and not outcome.summary['frames']:
+        raise DjetError(outcome.problem)
+    if outcome.problem:
+        # As of results: what could be replayed is used.
+        warn(outcome.problem)
+    return results, config
 
 
 def _with_loop_parameters(args: argparse.Namespace, results: Path) -> Config:

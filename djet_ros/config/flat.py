@@ -71,9 +71,9 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
             changes = {name.removeprefix(mark): value for name, value in checked.items()
                        if name.startswith(mark)}
             if changes:
-                section = replace(getattr(config, part), **changes)
+                changed = replace(getattr(config, part), **changes)
                 mark = ''  # checks across sections use full names in their messages
-                config = replace(config, **{part: section})
+                config = replace(config, **{part: changed})
     except ValueError as error:
         raise DjetError(f'{mark}{error}') from None
     return config

@@ -10,7 +10,7 @@ import re
 import textwrap
 from typing import Any
 
-from djet_ros.config.flat import flat, section, shown, Value, with_values
+from djet_ros.config.flat import flat, from_flat, section, shown, Value
 from djet_ros.config.safe_files import read_yaml
 from djet_ros.config.sections import Config, GRAPH_NAME, NODE_NAME, SECTIONS
 from djet_ros.core.estimator_config import preset
@@ -31,22 +31,22 @@ _PRESET_NOTE = """\
 """
 
 
-def load_yaml(path: Path, take: Callable[[Config, Mapping[str, Any]], Config] = with_values,
+def load_yaml(path: Path, take: Callable[[Mapping[str, Any]], Config] = from_flat,
               nodes: Sequence[str] = (NODE_NAME,)) -> Config:
     """
-    Return the defaults overridden by a YAML file.
+    Return the configuration of a YAML file.
 
     Both layouts are read: plain nested sections, and ROS's ``node: ros__parameters:`` with
     namespaces and wildcards. nodes: the nodes whose parameters are read, by full name such as
     '/left/vo_node', or without a leading slash for that node in any namespace. Of the pose graph
-    node only slam.* is read. take: applies the values to the defaults.
+    node only slam.* is read. take: makes the configuration from the values by flat name.
 
     Raises DjetError, beginning with the path, if the file is not such a file or has no
     parameters for these nodes.
     """
     content = read_yaml(path)
     try:
-        return take(Config(), _flattened(_ours(content, nodes)))
+        return take(_flattened(_ours(content, nodes)))
     except DjetError as error:
         raise DjetError(f'{path}: {error}') from None
 

@@ -8,7 +8,7 @@ import cv2
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.lab.corrected_images import corrected_images, CorrectedImage
-from djet_ros.recordings.frame_sequence import FrameSequence, ImageFiles
+from djet_ros.recordings.frame_sequence import FrameSequence, ImageFiles, Intrinsics
 from djet_ros.recordings.recording import BagRecording, refuse, Warn
 from djet_ros.replay.ground_truth import GroundTruth
 import numpy as np
@@ -24,7 +24,7 @@ class ExtractedSequence(FrameSequence):
         images = ImageFiles(sorted(folder.glob('*.png')))
         with np.load(folder / _INDEX, allow_pickle=False) as index:
             poses: Array = index['poses']
-            super().__init__(folder.name, images, index['K'], index['stamps_ns'],
+            super().__init__(folder.name, images, Intrinsics(index['K']), index['stamps_ns'],
                              poses if len(poses) else None)
             unseen = index['unseen']
         self._left_out: NDArray[np.bool_] | None = unseen if unseen.size else None

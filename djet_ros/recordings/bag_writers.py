@@ -14,6 +14,7 @@ import sqlite3
 from typing import Any
 
 from djet_ros.errors import DjetError
+from djet_ros.odometry import static_frames
 from djet_ros.odometry.messages import OPTICAL_TO_BODY
 from djet_ros.recordings.closing import Closing
 from djet_ros.recordings.decoding import jazzy, MAKE
@@ -50,33 +51,28 @@ LATCHED = qos(1, QosDurability.TRANSIENT_LOCAL)
 
 
 def write_kitti_bag(sequence: FrameSequence, out: Path, storage: str = 'mcap',
-                    progress: Callable[[int], None] | None = None,
-                    overwrite: bool = False) -> None:
+                    progress: Callable[[], None] = lambda: None, overwrite: bool = False
+                    ) -> None:
     """
     Write a sequence as a rosbag2 folder.
 
     Topics: /camera/image_rect (mono8; image_raw if distorted), /camera/camera_info,
     /ground_truth/pose (camera in the frame of the first camera, if known), /imu/data_raw (if the
     sequence has one) and /tf_static (map to camera_first, REP 103; camera to imu).
-    ``progress`` is called with the number of frames written so far. The bag gets its name when it
-    is complete; a failure or an interrupt leaves nothing behind (a kill leaves a hidden folder
-    next to it), and with ``overwrite`` keeps the old bag. Raises DjetError if ``out`` exists
-    (with ``overwrite``: if it holds anything but such a bag) or can't be written.
+    ``progress`` is called after each frame. The bag gets its name when it is complete; a failure
+    or an interrupt leaves nothing behind (a kill leaves a hidden folder next to it), and with
+    ``overwrite`` keeps the old bag. Raises DjetError if ``out`` exists (with ``overwrite``: if it
+    holds anything but such a bag) or can't be written.
     """
-    if storage not in STORAGES:
-        raise DjetError(f"storage is '{storage}'; choose from {', '.join(STORAGES)}")
     recording = SequenceRecording(sequence, imu=True)
     with _naming_errors(out), created_whole(out, overwrite, _is_written_here,
                                             'bag folder as this command writes it') as folder:
-        writer = Writer(folder, version=9, storage_plugin=STORAGES[storage])
-        with writer:
+        with Writer(folder, version=9, storage_plugin=STORAGES[storage]) as writer:
             _write_map_frame(writer, int(sequence.stamps_ns[0]))
-            written = 0
             for topic, stamp, message in recording.messages():
                 _write(writer, topic, message, stamp)
-                written += topic == recording.image_topic
-                if progress is not None and topic == recording.image_topic:
-                    progress(written)
+                if topic == recording.image_topic:
+                    progress()
 
 
 class ResultBag(Closing):
@@ -153,11 +149,11 @@ def _write_map_frame(writer: Writer, stamp_ns: int) -> None:
     """Write the pose of the first camera in the map (x forward, y left, z up)."""
     pose = np.eye(4)
     pose[:3, :3] = OPTICAL_TO_BODY
-    _write(writer, '/tf_static', MAKE.frame(stamp_ns, 'map', WORLD_FRAME, pose), stamp_ns)
+    _write(writer, static_frames.TOPIC, MAKE.frame(stamp_ns, 'map', WORLD_FRAME, pose), stamp_ns)
 
 
 def _connect(writer: Writer, topic: str, msgtype: str) -> Connection:
-    offered = LATCHED if topic == '/tf_static' else VOLATILE
+    offered = LATCHED if topic == static_frames.TOPIC else VOLATILE
     return writer.add_connection(topic, msgtype, typestore=jazzy(),
                                  offered_qos_profiles=[offered])
 

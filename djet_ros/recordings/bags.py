@@ -16,6 +16,7 @@ from djet_ros.recordings.closing import Closing
 from djet_ros.recordings.decoding import Decoder, decoder
 from djet_ros.recordings.storages import BrokenFile, Connection, open_storage, Storage
 from djet_ros.recordings.storages.compression import decompress_file, ZSTD_MAGIC
+from djet_ros.recordings.text import by_numbers
 
 # Stamps of ROS have seconds of 32 bits, since 1970.
 _STAMPS_END = 2**31 * 10**9
@@ -148,9 +149,7 @@ def _files(path: Path) -> list[Path]:
 def _storage_files(folder: Path) -> list[Path]:
     """Return the storage files of a folder in recorded order: name_2 comes before name_10."""
     files = [path for path in folder.iterdir() if STORAGE_NAMES.fullmatch(path.name)]
-    return sorted(files, key=lambda path: [
-        (int(word), '') if word.isdecimal() else (0, word)
-        for word in re.split(r'(\d+)', path.name)])
+    return sorted(files, key=by_numbers)
 
 
 def _listed(folder: Path) -> list[Path]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from djet_ros.config.safe_files import read_yaml
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError, one_line
 from djet_ros.odometry.camera import checked_distortion
 from djet_ros.odometry.images import BadMessage
+from djet_ros.recordings.frame_sequence import Intrinsics
 from djet_ros.recordings.kitti import check_rigid
 from djet_ros.recordings.text import lines, numbers
 import numpy as np
@@ -30,14 +31,6 @@ _ASL_MODELS = {'radial-tangential': ('plumb_bob', (0, 4, 5)), 'radtan': ('plumb_
 
 # What reading a value of another type, or of none, out of YAML may raise.
 _UNFIT = (AttributeError, KeyError, OverflowError, TypeError, ValueError)
-
-
-class Intrinsics(NamedTuple):
-    """K (3, 3) in pixels, and the distortion by OpenCV's coefficients of a model."""
-
-    K: Array
-    distortion: Sequence[float] = ()
-    model: str = 'plumb_bob'
 
 
 def camera_beside(folder: Path, size: tuple[int, int], published: Sequence[float] = ()
@@ -146,14 +139,11 @@ def asl_mounting(path: Path) -> Array:
 def _asl_sensor(path: Path) -> tuple[dict[str, Any], Array]:
     """Return a sensor.yaml, and the pose (4, 4) of the sensor in the body."""
     sensor = read_yaml(path)
-    if not isinstance(sensor, dict):
-        raise DjetError(f'{path} is no ASL sensor description: it has no T_BS; replace the file, '
-                        'which may be truncated')
     try:
         sensor_in_body = _rigid(sensor['T_BS']['data'])
     except _UNFIT as error:
-        raise DjetError(f'{path} is no ASL sensor description (T_BS): '
-                        f'{one_line(error)}') from error
+        raise DjetError(f'{path} is no ASL sensor description: it has no T_BS of 16 numbers; '
+                        'replace the file, which may be truncated') from error
     check_rigid(sensor_in_body[None], path)
     return sensor, sensor_in_body
 

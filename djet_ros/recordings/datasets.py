@@ -24,14 +24,11 @@ from djet_ros.recordings.frame_sequence import (
     ImageFiles,
 )
 from djet_ros.recordings.imu import ImuTrack, read_asl_imu
-from djet_ros.recordings.kitti import (
-    check_rigid,
-    KittiSequence,
-    read_times,
-    STAMP_OFFSET_NS,
-)
+from djet_ros.recordings.kitti import check_rigid, KittiSequence, STAMP_OFFSET_NS
 from djet_ros.recordings.kitti_raw import is_kitti_raw, kitti_raw
 from djet_ros.recordings.text import (
+    by_numbers,
+    image_stamps,
     increasing,
     lines,
     nanoseconds,
@@ -77,8 +74,7 @@ def tum_rgbd(folder: Path) -> FrameSequence:
     if (truth := folder / 'groundtruth.txt').exists():
         known, known_poses = read_tum(truth)
         poses = from_first(poses_at(increasing(known, truth), known_poses, stamps, LONGEST_GAP_NS))
-    return FrameSequence(folder.resolve().name, images, camera.K, stamps, poses,
-                         camera.distortion, camera.model)
+    return FrameSequence(folder.resolve().name, images, camera, stamps, poses)
 
 
 def seven_scenes(folder: Path) -> FrameSequence:
@@ -100,8 +96,8 @@ def seven_scenes(folder: Path) -> FrameSequence:
                 raise DjetError(f'{truth} has {len(rows)} rows; a pose must have 4')
             check_rigid(rows[None], truth)
             poses[index] = rows
-    return FrameSequence(folder.resolve().name, images, camera.K, _usual_stamps(len(paths)),
-                         from_first(poses), camera.distortion, camera.model)
+    return FrameSequence(folder.resolve().name, images, camera, _usual_stamps(len(paths)),
+                         from_first(poses))
 
 
 def plain_images(folder: Path) -> FrameSequence:
@@ -113,14 +109,14 @@ def plain_images(folder: Path) -> FrameSequence:
     added if they begin before it: a clock that ROS can use is kept. Without times.txt the images
     are taken to be at 30 Hz.
     """
-    paths = sorted(_images_in(folder), key=_by_numbers)
+    paths = sorted(_images_in(folder), key=by_numbers)
     images = ImageFiles(paths)
     camera, times = camera_beside(folder, images.size), folder / 'times.txt'
-    stamps = read_times(times, len(paths)) if times.exists() else _usual_stamps(len(paths))
+    stamps = (image_stamps(times, nanoseconds, len(paths)) if times.exists()
+              else _usual_stamps(len(paths)))
     if stamps[0] < STAMP_OFFSET_NS:
         stamps = stamps + STAMP_OFFSET_NS
-    return FrameSequence(folder.resolve().name, images, camera.K, stamps, None,
-                         camera.distortion, camera.model)
+    return FrameSequence(folder.resolve().name, images, camera, stamps, None)
 
 
 def euroc(folder: Path) -> FrameSequence:
@@ -148,8 +144,8 @@ def euroc(folder: Path) -> FrameSequence:
     elif (truth := mav / 'mocap0' / 'data.csv').exists():
         poses = from_first(poses_at(*_asl_states(truth, camera_in_body, 8), stamps,
                                     LONGEST_GAP_NS))
-    return FrameSequence(folder.resolve().name, images, lens.K, stamps, poses,
-                         lens.distortion, lens.model, _asl_imu(mav / 'imu0', camera_in_body))
+    return FrameSequence(folder.resolve().name, images, lens, stamps, poses,
+                         _asl_imu(mav / 'imu0', camera_in_body))
 
 
 def open_sequence(path: Path, own_poses: bool = True) -> FrameSequence:
@@ -191,12 +187,6 @@ def _images_in(folder: Path) -> Iterable[Path]:
     """Return the image files in a folder, hidden ones excepted."""
     return (path for path in folder.glob('*')
             if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith('.'))
-
-
-def _by_numbers(path: Path) -> list[tuple[int, str]]:
-    """Return a key by which 10.png comes after 9.png."""
-    return [(int(part), '') if part.isdecimal() else (0, part)
-            for part in re.split('([0-9]+)', path.name)]
 
 
 def _usual_stamps(count: int) -> NDArray[np.int64]:

@@ -73,9 +73,7 @@ def decoder(connection: Connection) -> Decoder:
     except Exception as error:
         raise BrokenFile(f"its type '{connection.msgtype[:80]}' can't be used: "
                          f'{type(error).__name__} {one_line(error)[:120]}') from error
-    convert: Callable[[Any], Any] = _identity
-    if converted:
-        convert = _converter(store, connection.msgtype)
+    convert = _converter(store, connection.msgtype) if converted else _identity
     return partial(_decode, connection, store, convert, largest)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 import struct
-from typing import Any
+from typing import Any, NamedTuple
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
@@ -26,6 +26,19 @@ _PNG_HEADER = 24
 IMAGE_SUFFIXES = ('.png', '.jpg', '.jpeg')
 
 
+class Intrinsics(NamedTuple):
+    """
+    K (3, 3) in pixels, pixel centres at integers, and the distortion by OpenCV's coefficients.
+
+    model: 'plumb_bob' (k1, k2, p1, p2 and k3), 'rational_polynomial' (up to 14) or 'equidistant'
+    (k1 to k4); fewer are filled up with zeros, as of rectified images.
+    """
+
+    K: Array
+    distortion: Sequence[float] = ()
+    model: str = 'plumb_bob'
+
+
 class DamagedImage(DjetError):
     """An image file that is cut short or can't be decoded; path: of the file."""
 
@@ -39,21 +52,18 @@ class FrameSequence:
     """
     Image files of one moving camera, with stamps and optionally ground truth and an IMU.
 
-    name: for display; K: (3, 3) camera matrix in pixels, pixel centres at integers; distortion:
-    OpenCV's coefficients of the model ('plumb_bob': k1, k2, p1, p2 and k3, zeros if the images
-    are rectified; 'rational_polynomial': up to 14; 'equidistant': k1 to k4); size: (width,
-    height); frame_paths: the files; stamps_ns: (N,) int64, strictly increasing, never 0; poses:
-    (N, 4, 4), camera in the frame of the first known pose, NaN for frames without ground truth,
-    or None without any; imu: samples of an IMU on the camera, or None.
+    name: for display; K, distortion, model: see ``Intrinsics``; size: (width, height);
+    frame_paths: the files; stamps_ns: (N,) int64, strictly increasing, never 0; poses: (N, 4, 4),
+    camera in the frame of the first known pose, NaN for frames without ground truth, or None
+    without any; imu: samples of an IMU on the camera, or None.
     """
 
-    def __init__(self, name: str, images: ImageFiles, K: Array, stamps_ns: NDArray[np.int64],
-                 poses: Array | None, distortion: Sequence[float] = (),
-                 model: str = 'plumb_bob', imu: ImuTrack | None = None) -> None:
+    def __init__(self, name: str, images: ImageFiles, camera: Intrinsics,
+                 stamps_ns: NDArray[np.int64], poses: Array | None,
+                 imu: ImuTrack | None = None) -> None:
         self.name = name
-        self.K = K
-        self.model = model
-        padding = (4 if model == 'equidistant' else 5) - len(distortion)
+        self.K, distortion, self.model = camera
+        padding = (4 if self.model == 'equidistant' else 5) - len(distortion)
         self.distortion = np.array([*distortion, *[0.0] * padding])
         self.size, self.frame_paths = images.size, images.paths
         self.stamps_ns = stamps_ns
@@ -61,10 +71,10 @@ class FrameSequence:
         self.imu = imu
         self._images = images
         try:
-            check_lens(K, images.size)
+            check_lens(self.K, images.size)
         except BadMessage as error:
             raise DjetError(f'{name}: {error}') from None
-        self._camera = Camera(K, self.distortion, images.size, model)
+        self._camera = Camera(self.K, self.distortion, images.size, self.model)
 
     def __len__(self) -> int:
         """Count the frames."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,13 +23,6 @@ class ImuTrack(NamedTuple):
     rates: Array
     accelerations: Array
     to_camera: Array
-
-    def until(self, start: int, stamp_ns: int) -> Iterator[int]:
-        """Yield sample indices from ``start`` to the first that is not before the stamp."""
-        for index in range(start, len(self.stamps_ns)):
-            yield index
-            if self.stamps_ns[index] >= stamp_ns:
-                return
 
 
 def read_asl_imu(path: Path, to_camera: Array, offset_ns: int = 0) -> ImuTrack:

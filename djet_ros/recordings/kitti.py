@@ -6,19 +6,18 @@ from pathlib import Path
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.recordings.frame_sequence import FrameSequence, from_first, ImageFiles
+from djet_ros.recordings.frame_sequence import FrameSequence, from_first, ImageFiles, Intrinsics
 from djet_ros.recordings.imu import ImuTrack, read_asl_imu
 from djet_ros.recordings.text import (
+    check_count,
     check_positions,
-    increasing,
+    image_stamps,
     lines,
     nanoseconds,
     number_rows,
-    numbers,
-    stamped_rows,
+    numbers_of,
 )
 import numpy as np
-from numpy.typing import NDArray
 
 # Offset of stamps in ns. times.txt begins at 0, but in ROS a stamp of 0 means "no time", and tf
 # lookups some seconds back must not become negative. A round number is easy to subtract, and
@@ -45,64 +44,52 @@ class KittiSequence(FrameSequence):
         paths = _image_paths(self.folder)
         chosen = _frame_range(len(paths), start, end, self.folder)
         K = read_camera(self.folder / 'calib.txt')
-        distortion = _distortion(self.folder / 'calib.txt')
-        stamps = read_times(self.folder / 'times.txt', len(paths))[chosen] + STAMP_OFFSET_NS
+        D = calibration_row(self.folder / 'calib.txt', 'D', 5)
+        camera = Intrinsics(K, () if D is None else D.tolist())
+        times = image_stamps(self.folder / 'times.txt', nanoseconds, len(paths))
         images = ImageFiles(paths[chosen])
         truth = None
         if own_poses and poses is None:
             poses = _poses_beside(self.folder)
         if poses is not None:
             truth = from_first(_poses(poses, len(paths))[chosen])
-        super().__init__(f'KITTI {self.folder.name}', images, K, stamps, truth, distortion,
-                         imu=_imu(self.folder))
+        super().__init__(f'KITTI {self.folder.name}', images, camera,
+                         times[chosen] + STAMP_OFFSET_NS, truth, _imu(self.folder))
 
 
 def read_camera(path: Path) -> Array:
     """Return K (3, 3) from the row P0 of a calib.txt; raise DjetError if P0 is invalid."""
-    number, P = _calibration(path, 'P0', 'it must give the 3x4 projection of camera 0')
+    P = required_row(path, 'P0', 12, 'it must give the 3x4 projection of camera 0').reshape(3, 4)
     if min(P[0, 0], P[1, 1]) <= 0 or P[2].tolist() != [0, 0, 1, 0] or P[1, 0] != 0:
-        raise DjetError(f'{path} line {number}: P0 is no projection of a rectified camera '
+        raise DjetError(f'{path}: P0 is no projection of a rectified camera '
                         f'(focal lengths {P[0, 0]:g} and {P[1, 1]:g}, last row '
                         f'{" ".join(f"{v:g}" for v in P[2])})')
     return P[:, :3].copy()
 
 
-def _calibration(path: Path, name: str, meaning: str) -> tuple[int, Array]:
-    """Return line and matrix (3, 4) of a row of a calib.txt; raise DjetError if it is missing."""
-    row = _row(path, name, 12)
+def required_row(path: Path, name: str, count: int, meaning: str = 'it may be truncated'
+                 ) -> Array:
+    """Return the same as ``calibration_row``; without the row raise DjetError with its meaning."""
+    row = calibration_row(path, name, count)
     if row is None:
         raise DjetError(f"{path} has no line '{name}:'; {meaning}")
-    return row[0], np.array(row[1]).reshape(3, 4)
+    return row
 
 
-def _distortion(path: Path) -> list[float]:
-    """Return the distortion coefficients of the row D of a calib.txt; none without the row."""
-    row = _row(path, 'D', 5)
-    return [] if row is None else row[1]
-
-
-def _row(path: Path, name: str, count: int) -> tuple[int, list[float]] | None:
-    """Return line and numbers of the first row of a name, or None; raise DjetError if wrong."""
-    rows = [(number, text.partition(':')[2]) for number, text in lines(path)
-            if text.partition(':')[0].strip() == name]
-    if not rows:
-        return None
-    number, row = rows[0]
-    try:
-        values = numbers(row)
-    except ValueError as error:
-        raise DjetError(f'{path} line {number}: {error}; correct or replace the file') from error
-    if len(values) != count:
-        raise DjetError(f'{path} line {number}: {name} has {len(values)} numbers; it must have '
-                        f'{count}')
-    return number, values
+def calibration_row(path: Path, name: str, count: int) -> Array | None:
+    """Return so many numbers of the first row ``name: ...`` of a calibration file, or None."""
+    for number, text in lines(path):
+        first, _, row = text.partition(':')
+        if first.strip() == name:
+            return np.array(numbers_of(f'{path} line {number}: {name}', row, count))
+    return None
 
 
 def _imu(folder: Path) -> ImuTrack | None:
     if not (folder / 'imu.csv').exists():
         return None
-    _, pose = _calibration(folder / 'calib.txt', 'Tr_imu_to_cam',
-                           'it must give the 3x4 pose of the IMU of imu.csv in camera 0')
+    pose = required_row(folder / 'calib.txt', 'Tr_imu_to_cam', 12, 'it must give the 3x4 pose of '
+                        'the IMU of imu.csv in camera 0').reshape(3, 4)
     check_rigid(np.vstack([pose, np.eye(4)[3]])[None], folder / 'calib.txt')
     return read_asl_imu(folder / 'imu.csv', pose[:, :3], STAMP_OFFSET_NS)
 
@@ -151,13 +138,6 @@ def _frame_range(count: int, start: int, end: int | None, folder: Path) -> slice
     return slice(start, stop)
 
 
-def read_times(path: Path, count: int) -> NDArray[np.int64]:
-    """Return stamps in ns of a times.txt, seconds of each of `count` images; raise DjetError."""
-    stamps, _ = stamped_rows(path, 1, nanoseconds)
-    _check_length(path, len(stamps), count)
-    return increasing(stamps, path)
-
-
 def _poses_beside(folder: Path) -> Path | None:
     published = folder.parent.parent / 'poses' / f'{folder.name}.txt'
     return published if published.exists() else None
@@ -165,11 +145,5 @@ def _poses_beside(folder: Path) -> Path | None:
 
 def _poses(path: Path, count: int) -> Array:
     poses = read_poses(path)
-    _check_length(path, len(poses), count)
+    check_count(path, len(poses), count)
     return poses
-
-
-def _check_length(path: Path, have: int, count: int) -> None:
-    if have != count:
-        raise DjetError(f'{path} has {have} lines for {count} images; it must have one '
-                        'per image')

@@ -15,17 +15,10 @@ from djet_ros.core.geometry import nearest_rotation
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.odometry.interpolation import poses_at
-from djet_ros.recordings.frame_sequence import FrameSequence, from_first, ImageFiles
+from djet_ros.recordings.frame_sequence import FrameSequence, from_first, ImageFiles, Intrinsics
 from djet_ros.recordings.imu import ImuTrack
-from djet_ros.recordings.kitti import check_rigid
-from djet_ros.recordings.text import (
-    check_positions,
-    increasing,
-    lines,
-    number_rows,
-    numbers,
-    stamped,
-)
+from djet_ros.recordings.kitti import check_rigid, required_row
+from djet_ros.recordings.text import check_positions, image_stamps, number_rows, read_stamps
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -57,13 +50,8 @@ def kitti_raw(folder: Path) -> FrameSequence:
     if not paths:
         raise DjetError(f'{folder / _IMAGES} holds no *.png; name a drive of the raw data')
     images = ImageFiles(paths)
-    stamps = _stamps(folder / 'image_00' / 'timestamps.txt')
-    if len(stamps) != len(paths):
-        raise DjetError(f'{folder}: timestamps.txt has {len(stamps)} lines for {len(paths)} '
-                        'images; there must be one per image')
-    increasing(stamps, folder / 'image_00' / 'timestamps.txt')
-    K, distortion, rectifying = _camera(_calibration_file(folder, 'calib_cam_to_cam.txt'),
-                                        images.size)
+    stamps = image_stamps(folder / 'image_00' / 'timestamps.txt', clock_nanoseconds, len(paths))
+    camera, rectifying = _camera(_calibration_file(folder, 'calib_cam_to_cam.txt'), images.size)
     poses = imu = None
     if (unit_in_camera := _unit_in_camera(folder, rectifying)) is not None:
         known, rows = _oxts(folder / 'oxts')
@@ -71,8 +59,7 @@ def kitti_raw(folder: Path) -> FrameSequence:
         poses = from_first(poses_at(known, units @ np.linalg.inv(unit_in_camera), stamps,
                                     _LONGEST_GAP_NS))
         imu = ImuTrack(known, rows[:, _RATES], rows[:, _ACCELERATIONS], unit_in_camera[:3, :3])
-    return FrameSequence(f'KITTI raw {folder.resolve().name}', images, K, stamps, poses,
-                         distortion.tolist(), imu=imu)
+    return FrameSequence(f'KITTI raw {folder.resolve().name}', images, camera, stamps, poses, imu)
 
 
 def _calibration_file(folder: Path, name: str) -> Path:
@@ -82,11 +69,6 @@ def _calibration_file(folder: Path, name: str) -> Path:
     if found is None:
         raise DjetError(f'{places[1]} is missing; download the calibration of that day')
     return found
-
-
-def _stamps(path: Path) -> NDArray[np.int64]:
-    return np.array([stamped(path, number, text, clock_nanoseconds)
-                     for number, text in lines(path)], np.int64)
 
 
 def clock_nanoseconds(text: str) -> int:
@@ -104,42 +86,25 @@ def clock_nanoseconds(text: str) -> int:
     return int(clock.timestamp()) * 10**9 + int(rest.ljust(9, '0'))
 
 
-def _calibration(path: Path, *counts: tuple[str, int]) -> list[Array]:
-    """Return the numbers of rows 'name: …' of a calibration file; counts: (name, length)."""
-    rows = {text.partition(':')[0].strip(): text.partition(':')[2] for _, text in lines(path)}
-    found = []
-    for name, count in counts:
-        try:
-            values = numbers(rows[name])
-        except KeyError:
-            raise DjetError(f"{path} has no line '{name}:'; it may be truncated") from None
-        except ValueError as error:
-            raise DjetError(f'{path}: {name}: {error}; correct or replace the file') from error
-        if len(values) != count:
-            raise DjetError(f'{path}: {name} has {len(values)} numbers; it must have {count}')
-        found.append(np.array(values))
-    return found
-
-
-def _camera(path: Path, size: tuple[int, int]) -> tuple[Array, Array, Array]:
-    """Return K, distortion and rectifying rotation for images of a size (rectified or raw)."""
-    rectified, raw = _calibration(path, ('S_rect_00', 2), ('S_00', 2))
+def _camera(path: Path, size: tuple[int, int]) -> tuple[Intrinsics, Array]:
+    """Return the camera and the rectifying rotation for images of a size (rectified or raw)."""
+    rectified, raw = (required_row(path, name, 2) for name in ('S_rect_00', 'S_00'))
     if tuple(rectified) == size:
-        P, R = _calibration(path, ('P_rect_00', 12), ('R_rect_00', 9))
-        K, distortion, turn = P.reshape(3, 4)[:, :3], np.zeros(5), R.reshape(3, 3)
+        K, distortion = required_row(path, 'P_rect_00', 12).reshape(3, 4)[:, :3], np.zeros(5)
+        turn = required_row(path, 'R_rect_00', 9).reshape(3, 3)
         rectified_axes = np.eye(4)
         rectified_axes[:3, :3] = turn
         check_rigid(rectified_axes[None], path)
     elif tuple(raw) == size:
-        K, distortion = _calibration(path, ('K_00', 9), ('D_00', 5))
-        K, turn = K.reshape(3, 3), np.eye(3)
+        K, distortion = required_row(path, 'K_00', 9).reshape(3, 3), required_row(path, 'D_00', 5)
+        turn = np.eye(3)
     else:
         raise DjetError(f'{path} is for images of {_size(rectified)} or {_size(raw)}, these are '
                         f'{_size(np.array(size))}; use the calibration of the same day')
     if min(K[0, 0], K[1, 1]) <= 0 or K[2].tolist() != [0, 0, 1]:
         raise DjetError(f'{path}: fx fy cx cy = {K[0, 0]:g} {K[1, 1]:g} {K[0, 2]:g} {K[1, 2]:g} '
                         'is no valid camera; focal lengths must be positive')
-    return K.copy(), distortion, turn
+    return Intrinsics(K.copy(), distortion.tolist()), turn
 
 
 def _size(size: Array) -> str:
@@ -156,9 +121,9 @@ def _unit_in_camera(folder: Path, rectifying: Array) -> Array | None:
     pose = np.eye(4)
     for name in names:
         path = _calibration_file(folder, name)
-        R, T = _calibration(path, ('R', 9), ('T', 3))
         step = np.eye(4)
-        step[:3, :3], step[:3, 3] = R.reshape(3, 3), T
+        step[:3, :3] = required_row(path, 'R', 9).reshape(3, 3)
+        step[:3, 3] = required_row(path, 'T', 3)
         check_rigid(step[None], path)
         pose = step @ pose
     turn = np.eye(4)
@@ -171,7 +136,7 @@ def _unit_in_camera(folder: Path, rectifying: Array) -> Array | None:
 
 def _oxts(folder: Path) -> tuple[NDArray[np.int64], Array]:
     """Return increasing stamps (M,) and rows (M, 30) of the GPS/IMU."""
-    stamps = _stamps(folder / 'timestamps.txt')
+    stamps = read_stamps(folder / 'timestamps.txt', clock_nanoseconds)
     paths = sorted((folder / 'data').glob('*.txt'))
     if len(stamps) != len(paths):
         raise DjetError(f'{folder}: timestamps.txt has {len(stamps)} lines for {len(paths)} files '

@@ -35,17 +35,14 @@ def check_file(path: Path, overwrite: bool, *suffixes: str, inputs: Iterable[Pat
     _check_unused(path, overwrite)
 
 
-def make_room(folder: Path, ours: Collection[str], overwrite: bool,
-              marks: Collection[str] = ()) -> None:
+def make_room(folder: Path, ours: Collection[str], overwrite: bool) -> None:
     """
     Make a folder for output, and remove what an earlier run wrote there, but no other files.
 
-    ours: names of the files and folders that a run writes; marks: files that identify a non-empty
-    folder as that of an earlier run (none: foreign files next to ours are accepted). Raises
-    DjetError if the folder is a foreign one, or ours without ``overwrite``, or can't be made;
-    raises OSError if earlier files can't be removed.
+    Arguments and errors are those of ``check_room``; raises OSError if earlier files can't be
+    removed.
     """
-    for path in check_room(folder, ours, overwrite, marks):
+    for path in check_room(folder, ours, overwrite):
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
         else:
@@ -58,7 +55,7 @@ def replaced_together(folder: Path, ours: Collection[str], overwrite: bool) -> I
     """
     Yield a temporary folder, whose files replace those of an earlier run once all are written.
 
-    On failure the earlier ones are kept. Arguments and errors are those of ``make_room``.
+    On failure the earlier ones are kept. Arguments and errors are those of ``check_room``.
     """
     check_room(folder, ours, overwrite)
     make_folder(folder)
@@ -74,8 +71,7 @@ class SetAside:
     """
     What an earlier run wrote into a folder, in a hidden folder there until it is given up.
 
-    Makes room as ``make_room`` does, with its arguments and errors. A run that is killed leaves
-    it hidden.
+    Arguments and errors are those of ``check_room``. A run that is killed leaves it hidden.
     """
 
     def __init__(self, folder: Path, ours: Collection[str], overwrite: bool,
@@ -138,7 +134,13 @@ def is_locked(path: Path) -> bool:
 
 def check_room(folder: Path, ours: Collection[str], overwrite: bool,
                marks: Collection[str] = ()) -> list[Path]:
-    """Return what ``make_room`` would remove, without removing it; raise DjetError as it does."""
+    """
+    Return what an earlier run wrote into a folder.
+
+    ours: names of the files and folders that a run writes; marks: files that identify a non-empty
+    folder as that of an earlier run (none: foreign files next to ours are accepted). Raises
+    DjetError if the folder is a foreign one, ours without ``overwrite``, or can't be one.
+    """
     _check_obstacles(folder)
     if marks and folder.is_dir() and any(folder.iterdir()) \
             and not all((folder / mark).is_file() for mark in marks):

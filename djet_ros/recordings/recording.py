@@ -37,7 +37,6 @@ RAW_IMAGE_TOPIC = '/camera/image_raw'
 INFO_TOPIC = '/camera/camera_info'
 GROUND_TRUTH_TOPIC = '/ground_truth/pose'
 IMU_TOPIC = '/imu/data_raw'
-STATIC_FRAMES_TOPIC = '/tf_static'
 CAMERA_FRAME = 'camera'
 IMU_FRAME = 'imu'
 WORLD_FRAME = 'camera_first'
@@ -117,22 +116,19 @@ class SequenceRecording(Recording):
         """
         self._sequence = sequence
         self._damaged = damaged
-        # Ground truth: poses with stamps of their own, or one pose per image (or None).
-        self._stamped: tuple[NDArray[np.int64], Array] | None = None
-        self._poses = sequence.poses
+        # Poses with stamps of their own, or with None one per image, if any are known.
+        self._truth_ns: NDArray[np.int64] | None = None
+        self._truth = sequence.poses
         if poses is not None:
-            stamps, truth = _read_truth(poses, len(sequence))
-            self._stamped = None if stamps is None else (stamps, truth)
-            self._poses = truth if stamps is None else None
+            self._truth_ns, self._truth = _read_truth(poses, len(sequence))
         self.ground_truth_file = poses
         self._imu = sequence.imu if imu else None
         # By ROS convention the topic's name shows whether images are rectified.
         self.image_topic = RAW_IMAGE_TOPIC if sequence.distorted else IMAGE_TOPIC
         self.info_topic = INFO_TOPIC
-        known = self._poses is not None or self._stamped is not None
-        self.ground_truth_topic = GROUND_TRUTH_TOPIC if known else None
+        self.ground_truth_topic = None if self._truth is None else GROUND_TRUTH_TOPIC
         self.auxiliary = {} if self._imu is None else {'imu': IMU_TOPIC,
-                                                       'frames': STATIC_FRAMES_TOPIC}
+                                                       'frames': static_frames.TOPIC}
 
     def __len__(self) -> int:
         """Count the images."""
@@ -145,18 +141,22 @@ class SequenceRecording(Recording):
         The image comes last, after everything up to its stamp and the first IMU sample not before
         it, so that a consumer can process it at once.
         """
-        sequence, next_sample = self._sequence, 0
-        yield from _stamped_poses(self._stamped)
+        sequence = self._sequence
+        samples: Iterator[BagMessage] = iter(())
+        if self._truth is not None and self._truth_ns is not None:
+            yield from _stamped_poses(self._truth_ns, self._truth)
+        if self._imu is not None and (
+                topics is None or not set(topics).isdisjoint(self.auxiliary.values())):
+            yield _imu_frame(int(sequence.stamps_ns[0]), self._imu)
+            samples = _imu_messages(self._imu)
         for index, stamp in enumerate(sequence.stamps_ns.tolist()):
-            if self._imu is not None and (
-                    topics is None or not set(topics).isdisjoint(self.auxiliary.values())):
-                if index == 0:
-                    yield _imu_frame(stamp, self._imu)
-                for sample in self._imu.until(next_sample, stamp):
-                    yield _imu_message(self._imu, sample)
-                    next_sample = sample + 1
-            if self._poses is not None and np.isfinite(self._poses[index]).all():
-                yield _ground_truth(stamp, self._poses[index])
+            for sample in samples:
+                yield sample
+                if sample.stamp_ns >= stamp:
+                    break
+            if self._truth is not None and self._truth_ns is None \
+                    and np.isfinite(self._truth[index]).all():
+                yield _ground_truth(stamp, self._truth[index])
             if topics is None or self.image_topic in topics:
                 yield BagMessage(INFO_TOPIC, stamp, MAKE.camera_info(
                     stamp, CAMERA_FRAME, sequence.K, sequence.size, sequence.distortion,
@@ -232,7 +232,7 @@ class BagRecording(Recording):
         if stamps is None:
             yield from self._with_poses(wanted, poses)
             return
-        yield from _stamped_poses((stamps, poses))
+        yield from _stamped_poses(stamps, poses)
         yield from self.bag.messages(wanted)
 
     def _with_poses(self, wanted: set[str], poses: Array) -> Iterator[BagMessage]:
@@ -268,8 +268,8 @@ class BagRecording(Recording):
                 yield what, chosen[0]
             elif strict:
                 raise DjetError(f'{self.bag.path} has {_why_not_one(what, name, have)}')
-        if wanted and any(topic.name == STATIC_FRAMES_TOPIC for topic in self._topics):
-            yield 'frames', STATIC_FRAMES_TOPIC
+        if wanted and any(topic.name == static_frames.TOPIC for topic in self._topics):
+            yield 'frames', static_frames.TOPIC
 
     def _require_one_type(self) -> None:
         """Raise DjetError if a chosen topic was recorded with several types."""
@@ -380,11 +380,10 @@ def _read_truth(path: Path, images: int) -> tuple[NDArray[np.int64] | None, Arra
     return None, poses
 
 
-def _stamped_poses(known: tuple[NDArray[np.int64], Array] | None) -> Iterator[BagMessage]:
-    """Yield messages of poses with stamps of their own, if there are any."""
-    if known is not None:
-        for stamp, pose in zip(known[0].tolist(), known[1], strict=True):
-            yield _ground_truth(stamp, pose)
+def _stamped_poses(stamps_ns: NDArray[np.int64], poses: Array) -> Iterator[BagMessage]:
+    """Yield messages of poses with stamps of their own."""
+    for stamp, pose in zip(stamps_ns.tolist(), poses, strict=True):
+        yield _ground_truth(stamp, pose)
 
 
 def _ground_truth(stamp: int, pose: Array) -> BagMessage:
@@ -395,11 +394,10 @@ def _imu_frame(stamp: int, imu: ImuTrack) -> BagMessage:
     """Return the static transform of the IMU, with its rotation only: rates need no position."""
     pose = np.eye(4)
     pose[:3, :3] = imu.to_camera
-    return BagMessage(STATIC_FRAMES_TOPIC, stamp,
+    return BagMessage(static_frames.TOPIC, stamp,
                       MAKE.frame(stamp, CAMERA_FRAME, IMU_FRAME, pose))
 
 
-def _imu_message(imu: ImuTrack, index: int) -> BagMessage:
-    stamp = int(imu.stamps_ns[index])
-    return BagMessage(IMU_TOPIC, stamp, MAKE.imu(
-        stamp, IMU_FRAME, imu.rates[index], imu.accelerations[index]))
+def _imu_messages(imu: ImuTrack) -> Iterator[BagMessage]:
+    for stamp, rates, accelerations in zip(imu.stamps_ns.tolist(), imu.rates, imu.accelerations):
+        yield BagMessage(IMU_TOPIC, stamp, MAKE.imu(stamp, IMU_FRAME, rates, accelerations))

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from decimal import Decimal, InvalidOperation
 import math
 from pathlib import Path
+import re
 
 from djet_ros.config.safe_files import read_text
 from djet_ros.core.types import Array
@@ -31,7 +32,7 @@ class LineFile:
         """Create the file, which must not exist."""
         self._file = path.open('xb', buffering=0)
 
-    def write(self, line: str) -> int:
+    def write(self, line: str) -> None:
         """Append a line, which includes its line end."""
         begin = self._file.tell()
         rest = line.encode()
@@ -42,7 +43,6 @@ class LineFile:
             self._file.truncate(begin)
             self._file.seek(begin)
             raise
-        return len(line)
 
     def fileno(self) -> int:
         """Return its descriptor."""
@@ -58,6 +58,12 @@ def lines(path: Path) -> Iterator[tuple[int, str]]:
     for number, line in enumerate(read_text(path).splitlines(), 1):
         if (text := line.strip()) and not text.startswith('#'):
             yield number, text
+
+
+def by_numbers(path: Path) -> list[tuple[int, str]]:
+    """Return a key by which 10.png comes after 9.png."""
+    return [(int(part), '') if part.isdecimal() else (0, part)
+            for part in re.split('([0-9]+)', path.name)]
 
 
 def numbers(text: str) -> list[float]:
@@ -78,24 +84,38 @@ def number_rows(path: Path, columns: int) -> Array:
     """Return the numbers (N, columns) of a text file, a row per line; raise DjetError."""
     table = array('d')
     for number, text in lines(path):
-        try:
-            row = numbers(text)
-        except ValueError as error:
-            raise DjetError(f'{path} line {number}: {error}; correct or replace it') from error
-        if len(row) != columns:
-            raise DjetError(f'{path} line {number} has {len(row)} numbers; it must have '
-                            f'{columns}')
-        table.extend(row)
+        table.extend(numbers_of(f'{path} line {number}', text, columns))
     return np.array(table, dtype=np.float64).reshape(-1, columns)
+
+
+def numbers_of(place: str, text: str, count: int) -> list[float]:
+    """Return so many numbers of a text; raise DjetError, beginning with its place, if wrong."""
+    try:
+        values = numbers(text)
+    except ValueError as error:
+        raise DjetError(f'{place}: {error}; correct or replace it') from error
+    if len(values) != count:
+        raise DjetError(f'{place} has {len(values)} numbers; it must have {count}')
+    return values
 
 
 def stamped_rows(path: Path, columns: int, stamp: Callable[[str], int]
                  ) -> tuple[NDArray[np.int64], Array]:
     """Return stamps (N,) in ns, exact, of the first column, and the others (N, columns - 1)."""
     rows = number_rows(path, columns)
-    stamps = [stamped(path, number, text.replace(',', ' ').split()[0], stamp)
-              for number, text in lines(path)]
-    return np.array(stamps, dtype=np.int64), rows[:, 1:]
+    return read_stamps(path, lambda text: stamp(text.replace(',', ' ').split()[0])), rows[:, 1:]
+
+
+def image_stamps(path: Path, stamp: Callable[[str], int], images: int) -> NDArray[np.int64]:
+    """Return the increasing stamps (N,) in ns of a file with a line per image, or DjetError."""
+    stamps = read_stamps(path, stamp)
+    check_count(path, len(stamps), images)
+    return increasing(stamps, path)
+
+
+def read_stamps(path: Path, stamp: Callable[[str], int]) -> NDArray[np.int64]:
+    """Return the stamps (N,) in ns of all lines; raise DjetError for the first that has none."""
+    return np.array([stamped(path, number, text, stamp) for number, text in lines(path)], np.int64)
 
 
 def stamped(path: Path, number: int, text: str, stamp: Callable[[str], int]) -> int:
@@ -112,6 +132,13 @@ def check_positions(positions: Array, path: Path) -> None:
     if wrong.size:
         raise DjetError(f'{path}: pose {wrong[0]} is at {positions[wrong[0]].tolist()} m, farther '
                         f'than {FARTHEST:g} m; is it a file of poses?')
+
+
+def check_count(path: Path, have: int, images: int) -> None:
+    """Raise DjetError if a file has not one line per image."""
+    if have != images:
+        raise DjetError(f'{path} has {have} lines for {images} images; it must have one per '
+                        'image')
 
 
 def increasing(stamps_ns: NDArray[np.int64], path: Path) -> NDArray[np.int64]:

@@ -13,9 +13,9 @@ from pathlib import Path
 
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
-from djet_ros.recordings.frame_sequence import FrameSequence, from_first, ImageFiles
+from djet_ros.recordings.frame_sequence import FrameSequence, from_first, ImageFiles, Intrinsics
 from djet_ros.recordings.kitti import check_rigid, STAMP_OFFSET_NS
-from djet_ros.recordings.text import increasing, lines, stamped, stamped_rows, whole_nanoseconds
+from djet_ros.recordings.text import image_stamps, stamped_rows, whole_nanoseconds
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,12 +37,11 @@ def varos(camera: Path, name: str) -> FrameSequence:
                         f'calibration of VAROS is for {SIZE[0]}x{SIZE[1]}')
     K = np.array([[FOCAL_LENGTH, 0, (SIZE[0] - 1) / 2],
                   [0, FOCAL_LENGTH, (SIZE[1] - 1) / 2], [0, 0, 1]])
-    stamps = _stamps(camera / 'camM0_timestamps.csv')
-    if len(stamps) != len(images.paths):
-        raise DjetError(f'{camera / "camM0_timestamps.csv"} has {len(stamps)} rows for '
-                        f'{len(images.paths)} images; there must be one per image')
+    stamps = image_stamps(camera / 'camM0_timestamps.csv',
+                          lambda row: whole_nanoseconds(row.partition(',')[0].strip()),
+                          len(images.paths))
     poses = _poses(camera / 'camM0_poses' / 'camM0_poses_transformation_matrix.csv', stamps)
-    return FrameSequence(f'VAROS {name}', images, K, stamps + STAMP_OFFSET_NS, poses)
+    return FrameSequence(f'VAROS {name}', images, Intrinsics(K), stamps + STAMP_OFFSET_NS, poses)
 
 
 def varos_camera(folder: Path) -> Path | None:
@@ -51,12 +50,6 @@ def varos_camera(folder: Path) -> Path | None:
         if (camera / 'camM0_timestamps.csv').exists() and any((camera / 'A').glob('*.png')):
             return camera
     return None
-
-
-def _stamps(path: Path) -> NDArray[np.int64]:
-    stamps = [stamped(path, number, text.partition(',')[0].strip(), whole_nanoseconds)
-              for number, text in lines(path)]
-    return increasing(np.array(stamps, np.int64), path)
 
 
 def _poses(path: Path, stamps: NDArray[np.int64]) -> Array | None:

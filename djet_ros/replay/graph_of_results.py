@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from collections.abc import Iterator
 import csv
+from dataclasses import replace
 import io
 from pathlib import Path
 from typing import NamedTuple
 
 from djet_ros.config.safe_files import read_text
-from djet_ros.config.sections import Config, NODE_NAME
+from djet_ros.config.sections import NODE_NAME
 from djet_ros.config.yaml_files import load_yaml
 from djet_ros.core.correction import Correction
 from djet_ros.core.types import Array, STARTED, Status, TRACKED
@@ -103,20 +104,31 @@ def _estimates(folder: Path, rows: list[_Row]
     """
     Return the motion and the rotation covariance of each row, as far as the bag has them.
 
-    Also returns why the bag could not be read to its end, or None; raises DjetError if it has no
-    motion at all.
+    The latter only for odometry of the camera: the bag does not contain the mounting of a base
+    frame. Also returns why the bag could not be read to its end, or None; raises DjetError if it
+    has no motion at all.
     """
+    config = load_yaml(folder / 'config.yaml').odometry
+    relative, integrated = (f'/{NODE_NAME}/{name}' for name in ('relative_pose_cov', 'odometry'))
+    to_optical = np.eye(4)
+    if config.frame_convention == 'body':
+        to_optical[:3, :3] = OPTICAL_TO_BODY.T
     # After a step back in time stamps may repeat, in this order.
     motions: defaultdict[int, deque[_Estimate]] = defaultdict(deque)
     covariances: defaultdict[int, deque[Array | None]] = defaultdict(deque)
     problem = None
     try:
-        for stamp, motion, covariance in _motions(folder / BAG,
-                                                  load_yaml(folder / 'config.yaml')):
-            if motion is None:
-                covariances[stamp].append(covariance)
-            else:
-                motions[stamp].append(motion)
+        with Bag(folder / BAG) as bag:
+            for topic, _, message in bag.messages(
+                    {relative} if config.base_frame else {relative, integrated}):
+                stamp, motion = pose_of(message)
+                if topic == integrated:
+                    covariances[stamp].append(
+                        rotation_covariance_of(message, to_optical[:3, :3].T))
+                else:
+                    covariance = np.asarray(message.pose.covariance, np.float64).reshape(6, 6)
+                    motions[stamp].append((to_optical @ motion @ to_optical.T,
+                                           rotated(to_optical[:3, :3], covariance)))
     except DjetError as error:
         if not motions:
             raise
@@ -125,30 +137,6 @@ def _estimates(folder: Path, rows: list[_Row]
              if row.status in TRACKED and motions[row.stamp_ns] else None for row in rows],
             [covariances[row.stamp_ns].popleft() if covariances[row.stamp_ns] else None
              for row in rows], problem)
-
-
-def _motions(bag: Path, config: Config
-             ) -> Iterator[tuple[int, _Estimate | None, Array | None]]:
-    """
-    Yield stamps of frames, each with its motion or with the rotation covariance of its pose.
-
-    The latter only for odometry of the camera: the bag does not contain the mounting of a base
-    frame.
-    """
-    relative, integrated = (f'/{NODE_NAME}/{name}' for name in ('relative_pose_cov', 'odometry'))
-    topics = {relative} if config.odometry.base_frame else {relative, integrated}
-    to_optical = np.eye(4)
-    if config.odometry.frame_convention == 'body':
-        to_optical[:3, :3] = OPTICAL_TO_BODY.T
-    with Bag(bag) as opened:
-        for topic, _, message in opened.messages(topics):
-            stamp, motion = pose_of(message)
-            if topic == integrated:
-                yield stamp, None, rotation_covariance_of(message, to_optical[:3, :3].T)
-                continue
-            covariance = np.asarray(message.pose.covariance, np.float64).reshape(6, 6)
-            yield (stamp, (to_optical @ motion @ to_optical.T,
-                           rotated(to_optical[:3, :3], covariance)), None)
 
 
 def _whole(rows: list[_Row], estimates: list[_Estimate | None]) -> list[_Row]:
@@ -164,19 +152,17 @@ def _steps(rows: list[_Row], poses: Array, estimates: list[_Estimate | None],
     used = {*references}
     for i, (row, pose, motion, covariance) in enumerate(
             zip(rows, poses, estimates, rotation_covariances)):
+        step = Step(row.stamp_ns, row.status, pose, row.previous_stamp_ns, keyframe=row.keyframe,
+                    camera_correction=row.camera_correction, rotation_covariance=covariance)
         if row.status in TRACKED:
             if motion is None or references[i] is None:
                 raise DjetError(f'{folder}: the motion to the frame with stamp {row.stamp_ns} ns '
                                 'is missing from the bag; replay the recording again')
-            yield Step(row.stamp_ns, row.status, pose, row.previous_stamp_ns,
-                       *motion, row.scale is not Scale.UNKNOWN,
-                       metric=row.scale is Scale.METRIC, keyframe=row.keyframe,
-                       camera_correction=row.camera_correction,
-                       rotation_covariance=covariance)
+            yield replace(step, motion=motion[0], covariance=motion[1],
+                          scale_known=row.scale is not Scale.UNKNOWN,
+                          metric=row.scale is Scale.METRIC)
         elif row.status in STARTED or i in used:
-            yield Step(row.stamp_ns, row.status, pose, row.previous_stamp_ns,
-                       keyframe=row.keyframe, camera_correction=row.camera_correction,
-                       rotation_covariance=covariance)
+            yield step
 
 
 def _references(rows: list[_Row]) -> list[int | None]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from itertools import chain, pairwise
 
 from djet_ros.errors import DjetError
 from djet_ros.recordings.bags import BagMessage
-from djet_ros.recordings.recording import Recording
+from djet_ros.recordings.recording import Recording, up_to_damage
 
 # Messages read ahead at most to find the next image: those of a fast IMU with a slow camera.
 _MAX_PIECE = 1000
@@ -19,35 +20,24 @@ def with_next_image(recording: Recording) -> Iterator[tuple[BagMessage, BagMessa
     The image is None if it is far ahead or at the end. An error of the recording is raised after
     the messages before it.
     """
-    pieces, problem = _pieces(recording), None
-    piece = next(pieces, [])
-    while piece:
-        following: list[BagMessage] = []
-        try:
-            following = next(pieces, [])
-        except DjetError as error:
-            problem = error
+    damages: list[str] = []
+    pieces = _pieces(up_to_damage(recording.messages(), damages.append), recording.image_topic)
+    for piece, following in pairwise(chain(pieces, [[]])):
         image = following[-1] if following and following[-1].topic == recording.image_topic \
             else None
         for message in piece:
             yield message, image
-        piece = following
-    if problem is not None:
-        raise problem
+    if damages:
+        raise DjetError(damages[0])
 
 
-def _pieces(recording: Recording) -> Iterator[list[BagMessage]]:
-    """Split the messages after each image, or after _MAX_PIECE messages without one."""
+def _pieces(messages: Iterable[BagMessage], image_topic: str) -> Iterator[list[BagMessage]]:
+    """Split messages after each image, or after _MAX_PIECE messages without one."""
     piece: list[BagMessage] = []
-    try:
-        for message in recording.messages():
-            piece.append(message)
-            if message.topic == recording.image_topic or len(piece) == _MAX_PIECE:
-                yield piece
-                piece = []
-    except DjetError:
-        if piece:
+    for message in messages:
+        piece.append(message)
+        if message.topic == image_topic or len(piece) == _MAX_PIECE:
             yield piece
-        raise
+            piece = []
     if piece:
         yield piece

@@ -129,12 +129,10 @@ class ResultsFolder(Closing):
 
     def add_frame(self, image: int, result: OdometryResult, seconds: float) -> None:
         """Write the result of a processed image (number from 0) and its processing time."""
-        try:
+        with _naming_errors(self.path):
             self._earlier.give_up()
             while self._derived:
                 self._derived.pop().unlink(missing_ok=True)
-        except OSError as error:
-            raise _blame(self.path, error) from error
         for trajectory in self._trajectories:
             trajectory.write(result.stamp_ns, result.pose)
         self._row((image, result.stamp_ns, result.status.value, '', *_details(result),
@@ -150,14 +148,12 @@ class ResultsFolder(Closing):
         """Write landmarks (M, 3) in the first camera, which are not refined any more."""
         if not len(places):
             return
-        try:
+        with _naming_errors(self.path):
             if self._landmarks is None:
                 self._landmarks = PointFile(
                     self.path / LANDMARKS, 'first camera: x right, y down, z ahead; in the '
                     'lengths of trajectory_tum.txt')
             self._landmarks.add(places)
-        except OSError as error:
-            raise _blame(self.path, error) from error
         self._map.append(places[:, [0, 2]].astype(np.float32))
 
     @property
@@ -168,11 +164,9 @@ class ResultsFolder(Closing):
     def add_drawing(self, image: int, drawing: NDArray[np.uint8]) -> None:
         """Write a drawing (H, W, 3) BGR of the pair that ends with an image (number from 0)."""
         path = self.path / DEBUG / f'{image:06d}.jpg'
-        try:
+        with _naming_errors(path):
             path.parent.mkdir(exist_ok=True)
             path.write_bytes(cv2.imencode('.jpg', drawing)[1].tobytes())
-        except OSError as error:
-            raise _blame(path, error) from error
 
     def publish(self, outgoing: Outgoing, stamp_ns: int) -> None:
         """Write a message under the topic of the live node."""
@@ -182,24 +176,20 @@ class ResultsFolder(Closing):
 
     def add_errors(self, pairs: list[Step], errors: PairErrors) -> None:
         """Write the errors of all pairs; cells of NaN are empty."""
-        try:
-            with (self.path / 'errors.csv').open('w', encoding='utf-8', newline='') as file:
-                rows = csv.writer(file, lineterminator='\n')
-                rows.writerow(('previous_stamp_ns', 'stamp_ns', 'status', 'rotation_error_deg',
-                               'translation_error_deg'))
-                rows.writerows(
-                    (pair.previous_stamp_ns, pair.stamp_ns, pair.status.value, *values)
-                    for pair, *values in zip(pairs, _cells(errors.rotation_deg),
-                                             _cells(errors.translation_deg), strict=True))
-        except OSError as error:
-            raise _blame(self.path, error) from error
+        with _naming_errors(self.path), \
+                (self.path / 'errors.csv').open('w', encoding='utf-8', newline='') as file:
+            rows = csv.writer(file, lineterminator='\n')
+            rows.writerow(('previous_stamp_ns', 'stamp_ns', 'status', 'rotation_error_deg',
+                           'translation_error_deg'))
+            rows.writerows(
+                (pair.previous_stamp_ns, pair.stamp_ns, pair.status.value, *values)
+                for pair, *values in zip(pairs, _cells(errors.rotation_deg),
+                                         _cells(errors.translation_deg), strict=True))
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Replace the summary atomically."""
-        try:
+        with _naming_errors(self.path):
             self._summarise(summary)
-        except OSError as error:
-            raise _blame(self.path, error) from error
 
     def _summarise(self, summary: dict[str, Any]) -> None:
         write_whole(self.path / SUMMARY, json.dumps(summary, indent=2) + '\n')
@@ -208,16 +198,13 @@ class ResultsFolder(Closing):
         """Complete the bag and close the files."""
         with interrupt_after(), ExitStack() as at_end:
             at_end.callback(self._keep_earlier)
-            try:
+            at_end.callback(self._bag.close)
+            with _naming_errors(self.path):
                 self._table.close()
                 for trajectory in self._trajectories:
                     trajectory.close()
                 if self._landmarks is not None:
                     self._landmarks.close()
-            except OSError as error:
-                raise _blame(self.path, error) from error
-            finally:
-                self._bag.close()
 
     def _keep_earlier(self) -> None:
         """Put the earlier results back if no image could be used."""
@@ -226,10 +213,8 @@ class ResultsFolder(Closing):
             self._earlier.put_back()
 
     def _row(self, values: tuple[Any, ...]) -> None:
-        try:
+        with _naming_errors(self.path):
             self._rows.writerow(values)
-        except OSError as error:
-            raise _blame(self.path, error) from error
 
 
 def _details(result: OdometryResult) -> tuple[Any, ...]:
@@ -249,9 +234,14 @@ def _cells(values: NDArray[np.float64]) -> list[str]:
     return [f'{value:.6f}' if np.isfinite(value) else '' for value in values]
 
 
-def _blame(path: Path, error: OSError) -> DjetError:
-    return DjetError(f'{path} could not be written: {error.strerror or error}; the results up to '
-                     'here are readable')
+@contextmanager
+def _naming_errors(path: Path) -> Iterator[None]:
+    """Convert errors to DjetError that names the path."""
+    try:
+        yield
+    except OSError as error:
+        raise DjetError(f'{path} could not be written: {error.strerror or error}; the results up '
+                        'to here are readable') from error
 
 
 def _choose_limits(axes: Any, landmarks: NDArray[np.float32]) -> None:
@@ -294,8 +284,5 @@ def plot_trajectory(path: Path, estimate: Array, truth: Array | None,
     axes.plot(*landmarks.T, ',', color='0.6', zorder=0, scalex=False, scaley=False)
     axes.grid(color='0.9')
     axes.legend(loc='best')
-    try:
-        with replaced_whole(path) as new:
-            figure.savefig(new, dpi=120)
-    except OSError as error:
-        raise _blame(path, error) from error
+    with _naming_errors(path), replaced_whole(path) as new:
+        figure.savefig(new, dpi=120)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from djet_ros.cli.lab.pair_runs import datasets_of
 from djet_ros.cli.options import (
@@ -114,24 +113,13 @@ def _rendered(executor: Executor, folder: Path, wanted: Sequence[tuple[str, int]
     places = [folder / f'{name}-{seed}-{frames}' for name, seed in wanted]
     # Poses are written last: a folder with poses is complete.
     missing = [executor.submit(render_sequence, name, place, frames, seed, overwrite=True)
-               for (name, seed), place in zip(wanted, places) if not _is_complete(place)]
+               for (name, seed), place in zip(wanted, places)
+               if not any(place.glob('poses/*.txt'))]
     with progress_bar('scenes', len(missing)) as progress:
-        _await(missing, progress)
-    return [next(place.glob('sequences/*')) for place in places]
-
-
-def _await(futures: Sequence[Any], progress: Callable[..., None]) -> None:
-    try:
-        for future in as_completed(futures):
+        for future in as_completed(missing):
             future.result()
             progress()
-    finally:
-        for future in futures:
-            future.cancel()
-
-
-def _is_complete(place: Path) -> bool:
-    return any(place.glob('poses/*.txt'))
+    return [next(place.glob('sequences/*')) for place in places]
 
 
 def _show(rows: Sequence[CoverageRow], records: Sequence[Coverage]) -> None:

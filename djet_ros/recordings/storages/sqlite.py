@@ -116,13 +116,11 @@ def _ends_within_page(path: Path) -> bool:
 
 def _but_last_before_break(messages: Iterator[Message]) -> Iterator[Message]:
     """Drop the last message of a file truncated within a page, which sqlite fills with zeros."""
-    held = next(messages, None)
+    held: list[Message] = []
     for message in messages:
-        if held is not None:
-            yield held
-        held = message
-    if held is not None:
-        yield held
+        yield from held
+        held = [message]
+    yield from held
 
 
 def _checked(row: tuple[Any, Any, Any]) -> Message:
