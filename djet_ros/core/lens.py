@@ -26,6 +26,7 @@ from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import essential, fit_rotation, inverses, rays, rotation_log, unit
 from djet_ros.core.jet import (
     clipped_scale,
+    entries,
     epipolar_residuals,
     JetProblem,
     LEAST_CURVATURE,
@@ -273,8 +274,7 @@ def _problem(pair: MatchedPair, lens: Lens, k1: float) -> tuple[JetProblem, Arra
     """
     x, _ = _undistorted(pair.x, lens, k1)
     y, by_pixel = _undistorted(pair.y, lens, k1)
-    S = by_pixel @ by_pixel.transpose(0, 2, 1)
-    spread = np.stack([S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]])
+    spread = entries(by_pixel @ by_pixel.transpose(0, 2, 1))
     width = (spread[0] + spread[2]) / 2
     rays_x, rays_y = (np.vstack([one.T, np.ones(len(one))]) for one in (x, y))
     blur = EstimatorConfig.epipole_blur**2 * width**2

@@ -219,7 +219,7 @@ def _camera_of_two_motions(algorithm: Algorithm, track: Track, noise: float) -> 
     if camera == 1:
         members = np.zeros(len(pair.y), bool)
         members[first.voting] = second.members
-        track = algorithm.rerun(second.pose, alive=members) or track
+        track = algorithm.rerun(second.motions[1], alive=members) or track
     if decided is None:
         other = second.motions[1 - camera]
         return replace(track, rivals=(Rival(other, 0.0),), body_ambiguous=True)
