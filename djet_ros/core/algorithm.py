@@ -24,7 +24,6 @@ from djet_ros.core.geometry import (
     epipolar_lines,
     fundamental,
     inverse_depths,
-    line_distances,
     line_values,
     norms,
     patch_warp,
@@ -40,11 +39,10 @@ from djet_ros.core.jet import (
     MAX_STEPS,
     minimise,
     Residuals,
-    robust_scale,
     Solution,
 )
 from djet_ros.core.joining import fuse_alignment
-from djet_ros.core.pair import Limits, Pair, Round
+from djet_ros.core.pair import Pair, Round
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
 from djet_ros.core.patches import Aligned, unaligned
 from djet_ros.core.rivals import (
@@ -76,8 +74,6 @@ class AlgorithmTuning:
     # chosen: optimiser steps in a first round on matched points, whose pose only places the
     # surfaces
     first_round_steps: int = 2
-    # chosen: factor on the noise limit of a pair after that first round
-    first_round_noise: float = 1.25
     # pixels; chosen: noise of inliers when planes are fitted to their depths
     depth_noise: float = 0.1
     # robust standard deviations; usual inlier threshold
@@ -201,15 +197,14 @@ class Algorithm:
         """Run the algorithm afresh from a single pose, on the matches in a mask (N,) or all."""
         return Algorithm(self.pair, self.surface, self.config, alive).run([start], predicted)
 
-    def run(self, starts: list[Pose], predicted: PreviousMotion | None = None,
-            limits: Limits | None = None) -> Track | None:
+    def run(self, starts: list[Pose], predicted: PreviousMotion | None = None) -> Track | None:
         """
         Make rounds until the pose converges; None if too few matches have a surface.
 
         starts: poses among whose basins the first round chooses; if there are none, it chooses
-        among those around the predicted motion. limits: also None as soon as they are exceeded.
+        among those around the predicted motion.
         """
-        limits, poses, rounds = limits or Limits(), starts, list[Round]()
+        poses, rounds = starts, list[Round]()
         # If the matches were predicted and tracked, their pose is accurate enough to sample
         # surfaces only once: around their places on its epipolar lines, under its patch warps.
         # The first round then uses re-projection errors.
@@ -218,8 +213,7 @@ class Algorithm:
             # Step 1: update the local residuals around the keypoints: A', b, c.
             fits, paraboloids, indefinite = self._fitted(by_points)
             voting = self._voting(paraboloids)
-            if (voting.sum() < self.config.min_matches
-                    or voting.sum() <= limits.min_agreeing * len(voting)):
+            if voting.sum() < self.config.min_matches:
                 return None
             # Step 2: global pose optimisation.
             optimised = self._optimised(paraboloids, voting, poses, predicted, by_points)
@@ -229,9 +223,6 @@ class Algorithm:
                     or len(rounds) + 1 == self.config.max_iterations):
                 break
             pose = optimised.solution.pose
-            if by_points and (self._match_noise(pose)
-                              > ALGORITHM_TUNING.first_round_noise * limits.max_noise):
-                return None
             # Keypoints move towards their optimum on the epipolar line of the new pose.
             rounds.append(self._round(fits, paraboloids, pose))
             self._advance(pose, rounds[-1].optimum)
@@ -299,11 +290,6 @@ class Algorithm:
             bound = ALGORITHM_TUNING.cull_factor * loss.scale
             self._on_motion[voting] = np.abs(solution.residuals.r) < bound
         return OptimisedPose(voting, x, problem, loss, solution, converged, basin.rivals)
-
-    def _match_noise(self, pose: Pose) -> float:
-        """Return the robust standard deviation of the epipolar distances, in pixels."""
-        lines = epipolar_lines(fundamental(self._K, pose.R, pose.t), self.surface.x)
-        return robust_scale(line_distances(lines, self.pair.y))
 
     def _round(self, fits: Paraboloids, paraboloids: Paraboloids, pose: Pose) -> Round:
         """Find the optimum of each keypoint on its epipolar line, update losses."""

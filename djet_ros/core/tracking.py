@@ -48,12 +48,11 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
     surface: residual surfaces on the matches of the pair. Without starts, basins are sought around
     the predicted motion of the pair; the keypoints were tracked from its prediction, accurately
     enough for round one to use re-projection errors in place of surfaces. A single start is
-    optimised as it is. None if too few matches have a usable surface, or if the pair exceeds its
-    limits.
+    optimised as it is. None if too few matches have a usable surface.
     """
     predicted = None if starts else pair.predicted
     algorithm = Algorithm(pair, surface, config)
-    track = algorithm.run(starts, predicted, pair.limits)
+    track = algorithm.run(starts, predicted)
     if track is None or len(starts) == 1:
         return track
 
