@@ -163,11 +163,6 @@ class LensFit:
     linearised: tuple[Linearised, ...]
     disagreement: float
 
-    @property
-    def noise(self) -> float:
-        """Return the median distance of matches from their epipolar lines, in pixels."""
-        return float(np.median([one.noise for one in self.linearised]))
-
 
 def fit_lens(pairs: Sequence[MatchedPair], lens: Lens) -> LensFit | None:
     """

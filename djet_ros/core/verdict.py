@@ -58,8 +58,9 @@ _RANDOM_BITS = 112
 # Factor by which parallax has to exceed the noise of the matches.
 _PARALLAX_OVER_NOISE = 3.0
 
-# And factor beyond which that noise is no part of the information about t, to 5 % of nearly all
-# standard deviations in rendered and real scenes: the share falls with the square.
+# And factor beyond which noise along the epipolar lines, which passes for parallax, may count as
+# information about t: its share falls with the square, and is below 5 % of nearly all standard
+# deviations in rendered and real scenes.
 _FAR_OVER_NOISE = 50.0
 
 # chosen: factor by which preferences overstate the evidence, as neighbouring cells have correlated
