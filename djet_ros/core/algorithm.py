@@ -46,6 +46,7 @@ from djet_ros.core.pair import Pair, Round
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
 from djet_ros.core.patches import Aligned, unaligned
 from djet_ros.core.rivals import (
+    INLIER,
     pose_distance,
     PreviousMotion,
     refined_rivals,
@@ -76,8 +77,6 @@ class AlgorithmTuning:
     first_round_steps: int = 2
     # pixels; chosen: noise of inliers when planes are fitted to their depths
     depth_noise: float = 0.1
-    # robust standard deviations; usual inlier threshold
-    inlier: float = 3.0
 
 
 ALGORITHM_TUNING = AlgorithmTuning()
@@ -134,7 +133,7 @@ class Track:
 
     def inliers(self) -> NDArray[np.bool_]:
         """Return the (N,) bool mask of voting matches within the inlier threshold of the pose."""
-        agree = np.abs(self.residuals.r) < ALGORITHM_TUNING.inlier * self.scale
+        agree = np.abs(self.residuals.r) < INLIER * self.scale
         inliers = self.voting.copy()
         inliers[inliers] = agree
         return inliers

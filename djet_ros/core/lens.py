@@ -71,9 +71,6 @@ _RADIUS_SHARE, _MAX_AREA_RATIO = 0.01, 1.25
 # Step of k1 for numerical derivatives.
 _STEP = 1e-4
 
-# Scale of the robust loss in standard deviations, as in the odometry.
-_LOSS_SCALE = 3.0
-
 # Pixels; lower bound of the noise, for exact matches.
 _LEAST_NOISE = 1e-4
 
@@ -227,7 +224,7 @@ def linearise(pair: MatchedPair, lens: Lens, k1: float) -> Linearised:
     problem, by_pixel = _problem(pair, lens, k1)
     R, t = pair.pose.R, pair.pose.t
     noise = max(clipped_scale(epipolar_residuals(problem, R, t).r), _LEAST_NOISE)
-    loss = Loss('geman_mcclure', _LOSS_SCALE * noise)
+    loss = Loss(EstimatorConfig.loss, EstimatorConfig.loss_scale * noise)
     solution = minimise(problem, R, t, loss)
     r = solution.residuals.r
     weights = loss(r * r)[1]

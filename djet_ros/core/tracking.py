@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from djet_ros.core.algorithm import Algorithm, ALGORITHM_TUNING, Track
+from djet_ros.core.algorithm import Algorithm, Track
 from djet_ros.core.basins import BASIN_TUNING, better_by_parts, likeliest
 from djet_ros.core.bodies import continuing_motion
 from djet_ros.core.estimator_config import EstimatorConfig
@@ -19,6 +19,7 @@ from djet_ros.core.jet import Loss
 from djet_ros.core.pair import Pair
 from djet_ros.core.rivals import (
     continues_motion,
+    INLIER,
     is_planar,
     motion_without_attached,
     planar_twin,
@@ -171,7 +172,7 @@ def _attached_to_camera(algorithm: Algorithm, track: Track, noise: float
     pair, first, measured = algorithm.pair, algorithm.first, algorithm.pair.known.rotation
     if pair.known.stood:
         return None
-    fixed = norms(pair.y - pair.x) < ALGORITHM_TUNING.inlier * noise
+    fixed = norms(pair.y - pair.x) < INLIER * noise
     world = motion_without_attached(first.problem, fixed[first.voting], track.pose, noise,
                                     algorithm.config.min_matches, pair.prior)
     if world is None or (measured is not None and measured.prefers(track.pose.R, world.R)):

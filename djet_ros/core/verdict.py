@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from djet_ros.core.algorithm import ALGORITHM_TUNING, Track
+from djet_ros.core.algorithm import Track
 from djet_ros.core.correction import turn_of_deviating_camera
 from djet_ros.core.covariance import (
     calibration_covariance,
@@ -40,6 +40,7 @@ from djet_ros.core.patches import unaligned
 from djet_ros.core.rivals import (
     continues_motion,
     false_alarms,
+    INLIER,
     may_stand,
     pose_distance,
     preferences,
@@ -245,7 +246,7 @@ def _false_alarm(pair: Pair, track: Track, agreeing: int, config: EstimatorConfi
     count as tested too.
     """
     radius = min(config.search_radius, 0.5) * max(pair.current.gray.shape)
-    chance = 4 * ALGORITHM_TUNING.inlier * track.scale / (np.pi * radius)
+    chance = 4 * INLIER * track.scale / (np.pi * radius)
     return false_alarms(agreeing, len(track.voting) + pair.outliers, chance) > 0
 
 
