@@ -65,21 +65,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-@dataclass(frozen=True)
-class AlgorithmTuning:
-    """Constants of Algorithm 1; "chosen" is by judgement or trial, not derived."""
+# Loss scales; chosen: if most matches follow another motion, matches beyond this are removed,
+# where they have next to no weight anyway.
+_CULL_FACTOR = 2.0
 
-    # loss scales; chosen: if most matches follow another motion, matches beyond this are removed,
-    # where they have next to no weight anyway
-    cull_factor: float = 2.0
-    # chosen: optimiser steps in a first round on matched points, whose pose only places the
-    # surfaces
-    first_round_steps: int = 2
-    # pixels; chosen: noise of inliers when planes are fitted to their depths
-    depth_noise: float = 0.1
+# chosen: optimiser steps in a first round on matched points, whose pose only places the surfaces.
+_FIRST_ROUND_STEPS = 2
 
-
-ALGORITHM_TUNING = AlgorithmTuning()
+# Pixels; chosen: noise of inliers when planes are fitted to their depths.
+_DEPTH_NOISE = 0.1
 
 
 @dataclass(frozen=True)
@@ -281,13 +275,12 @@ class Algorithm:
         else:
             basin = basin_of(problem, poses[0])
         loss = Loss(config.loss, config.loss_scale * basin.scale)
-        steps = ALGORITHM_TUNING.first_round_steps if by_points else MAX_STEPS
+        steps = _FIRST_ROUND_STEPS if by_points else MAX_STEPS
         solution = minimise(problem, basin.pose.R, basin.pose.t, loss, steps, basin.residuals)
         converged = len(poses) == 1 and pose_distance(basin.pose, solution.pose) < config.epsilon
         if basin.camera_in_minority:
             # Matches of the other motion may be the majority, and would bias the noise estimate.
-            bound = ALGORITHM_TUNING.cull_factor * loss.scale
-            self._on_motion[voting] = np.abs(solution.residuals.r) < bound
+            self._on_motion[voting] = np.abs(solution.residuals.r) < _CULL_FACTOR * loss.scale
         return OptimisedPose(voting, x, problem, loss, solution, converged, basin.rivals)
 
     def _round(self, fits: Paraboloids, paraboloids: Paraboloids, pose: Pose) -> Round:
@@ -396,7 +389,7 @@ def _warps(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.
     indices = np.flatnonzero(plausible)
     x, y, rays_x, rays_y = (places.take(indices, axis=0) for places in (x, y, rays_x, rays_y))
     rho, sigma = inverse_depths(pose.R, pose.t, rays_x, rays_y)
-    slopes = slopes_of_all(x, rho, ALGORITHM_TUNING.depth_noise / K[0, 0] * sigma)
+    slopes = slopes_of_all(x, rho, _DEPTH_NOISE / K[0, 0] * sigma)
     slanted = warp.take(indices, axis=0) + slant_warp(K, pose.t, y, ratio[indices], slopes)
     slant_ok = has_moderate_stretch(slanted)
     warp[indices[slant_ok]] = slanted[slant_ok]
