@@ -29,10 +29,8 @@ from djet_ros.core.geometry import (
     unit,
 )
 from djet_ros.core.hamming import dense_descriptors
-from djet_ros.core.jet import robust_scale
-from djet_ros.core.pair import Limits, Pair
+from djet_ros.core.pair import Pair
 from djet_ros.core.radial import distort
-from djet_ros.core.rivals import PreviousMotion
 from djet_ros.core.starts import five_point, KnownMotion, likely_starts, planar_starts
 from djet_ros.core.surfaces import DescriptorSurface
 from djet_ros.core.tracking import track_jointly
@@ -441,26 +439,6 @@ def test_stage_times_add_up_to_the_total(pair, threads):
     assert set(stages) == {'matching', 'starts', 'jet', 'result'}
     assert all(seconds >= 0 for seconds in stages.values())
     assert 0.8 * took < sum(stages.values()) < took
-
-
-@pytest.mark.parametrize(('limit', 'value'), [('max_noise', 0.7), ('min_agreeing', 1.0)])
-def test_estimation_stops_beyond_the_limits_before_the_verdict(limit, value):
-    scene = make_scene('road', size=(620, 188))
-    estimator = TwoViewEstimator()
-    a, b = (estimator.view(scene.render(pose, i), scene.K)
-            for i, pose in enumerate(scene.trajectory(2)))
-    alone = estimator.estimate(a, b)
-    least = {'max_noise': robust_scale(alone.residuals),
-             'min_agreeing': alone.voting.mean()}[limit]
-    assert limit == 'max_noise' or least < 1
-    pair = Pair(a, b, alone.x, alone.y, predicted=PreviousMotion(alone.R, alone.t))
-    within = {'max_noise': 1.2 * least, 'min_agreeing': 0.9 * alone.inliers.mean()}[limit]
-    assert estimator.estimate_pair(replace(pair, limits=Limits(**{limit: within}), timings={})
-                                   ).status == Status.OK
-    given_up = estimator.estimate_pair(
-        replace(pair, limits=Limits(**{limit: value * least}), timings={}))
-    assert given_up.status == Status.TOO_FEW_MATCHES
-    assert 'result' not in given_up.timings
 
 
 def test_stage_times_of_a_second_attempt_are_added(pair):

@@ -24,7 +24,6 @@ from djet_ros.core.geometry import (
     epipolar_lines,
     fundamental,
     inverse_depths,
-    line_distances,
     line_values,
     norms,
     patch_warp,
@@ -40,14 +39,14 @@ from djet_ros.core.jet import (
     MAX_STEPS,
     minimise,
     Residuals,
-    robust_scale,
     Solution,
 )
 from djet_ros.core.joining import fuse_alignment
-from djet_ros.core.pair import Limits, Pair, Round
+from djet_ros.core.pair import Pair, Round
 from djet_ros.core.paraboloid import constrained_minimum, Paraboloids
 from djet_ros.core.patches import Aligned, unaligned
 from djet_ros.core.rivals import (
+    INLIER,
     pose_distance,
     PreviousMotion,
     refined_rivals,
@@ -66,25 +65,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-@dataclass(frozen=True)
-class AlgorithmTuning:
-    """Constants of Algorithm 1; "chosen" is by judgement or trial, not derived."""
+# Loss scales; chosen: if most matches follow another motion, matches beyond this are removed,
+# where they have next to no weight anyway.
+_CULL_FACTOR = 2.0
 
-    # loss scales; chosen: if most matches follow another motion, matches beyond this are removed,
-    # where they have next to no weight anyway
-    cull_factor: float = 2.0
-    # chosen: optimiser steps in a first round on matched points, whose pose only places the
-    # surfaces
-    first_round_steps: int = 2
-    # chosen: factor on the noise limit of a pair after that first round
-    first_round_noise: float = 1.25
-    # pixels; chosen: noise of inliers when planes are fitted to their depths
-    depth_noise: float = 0.1
-    # robust standard deviations; usual inlier threshold
-    inlier: float = 3.0
+# chosen: optimiser steps in a first round on matched points, whose pose only places the surfaces.
+_FIRST_ROUND_STEPS = 2
 
-
-ALGORITHM_TUNING = AlgorithmTuning()
+# Pixels; chosen: noise of inliers when planes are fitted to their depths.
+_DEPTH_NOISE = 0.1
 
 
 @dataclass(frozen=True)
@@ -138,7 +127,7 @@ class Track:
 
     def inliers(self) -> NDArray[np.bool_]:
         """Return the (N,) bool mask of voting matches within the inlier threshold of the pose."""
-        agree = np.abs(self.residuals.r) < ALGORITHM_TUNING.inlier * self.scale
+        agree = np.abs(self.residuals.r) < INLIER * self.scale
         inliers = self.voting.copy()
         inliers[inliers] = agree
         return inliers
@@ -201,15 +190,14 @@ class Algorithm:
         """Run the algorithm afresh from a single pose, on the matches in a mask (N,) or all."""
         return Algorithm(self.pair, self.surface, self.config, alive).run([start], predicted)
 
-    def run(self, starts: list[Pose], predicted: PreviousMotion | None = None,
-            limits: Limits | None = None) -> Track | None:
+    def run(self, starts: list[Pose], predicted: PreviousMotion | None = None) -> Track | None:
         """
         Make rounds until the pose converges; None if too few matches have a surface.
 
         starts: poses among whose basins the first round chooses; if there are none, it chooses
-        among those around the predicted motion. limits: also None as soon as they are exceeded.
+        among those around the predicted motion.
         """
-        limits, poses, rounds = limits or Limits(), starts, list[Round]()
+        poses, rounds = starts, list[Round]()
         # If the matches were predicted and tracked, their pose is accurate enough to sample
         # surfaces only once: around their places on its epipolar lines, under its patch warps.
         # The first round then uses re-projection errors.
@@ -218,8 +206,7 @@ class Algorithm:
             # Step 1: update the local residuals around the keypoints: A', b, c.
             fits, paraboloids, indefinite = self._fitted(by_points)
             voting = self._voting(paraboloids)
-            if (voting.sum() < self.config.min_matches
-                    or voting.sum() <= limits.min_agreeing * len(voting)):
+            if voting.sum() < self.config.min_matches:
                 return None
             # Step 2: global pose optimisation.
             optimised = self._optimised(paraboloids, voting, poses, predicted, by_points)
@@ -229,9 +216,6 @@ class Algorithm:
                     or len(rounds) + 1 == self.config.max_iterations):
                 break
             pose = optimised.solution.pose
-            if by_points and (self._match_noise(pose)
-                              > ALGORITHM_TUNING.first_round_noise * limits.max_noise):
-                return None
             # Keypoints move towards their optimum on the epipolar line of the new pose.
             rounds.append(self._round(fits, paraboloids, pose))
             self._advance(pose, rounds[-1].optimum)
@@ -291,19 +275,13 @@ class Algorithm:
         else:
             basin = basin_of(problem, poses[0])
         loss = Loss(config.loss, config.loss_scale * basin.scale)
-        steps = ALGORITHM_TUNING.first_round_steps if by_points else MAX_STEPS
+        steps = _FIRST_ROUND_STEPS if by_points else MAX_STEPS
         solution = minimise(problem, basin.pose.R, basin.pose.t, loss, steps, basin.residuals)
         converged = len(poses) == 1 and pose_distance(basin.pose, solution.pose) < config.epsilon
         if basin.camera_in_minority:
             # Matches of the other motion may be the majority, and would bias the noise estimate.
-            bound = ALGORITHM_TUNING.cull_factor * loss.scale
-            self._on_motion[voting] = np.abs(solution.residuals.r) < bound
+            self._on_motion[voting] = np.abs(solution.residuals.r) < _CULL_FACTOR * loss.scale
         return OptimisedPose(voting, x, problem, loss, solution, converged, basin.rivals)
-
-    def _match_noise(self, pose: Pose) -> float:
-        """Return the robust standard deviation of the epipolar distances, in pixels."""
-        lines = epipolar_lines(fundamental(self._K, pose.R, pose.t), self.surface.x)
-        return robust_scale(line_distances(lines, self.pair.y))
 
     def _round(self, fits: Paraboloids, paraboloids: Paraboloids, pose: Pose) -> Round:
         """Find the optimum of each keypoint on its epipolar line, update losses."""
@@ -411,7 +389,7 @@ def _warps(pose: Pose, K: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.
     indices = np.flatnonzero(plausible)
     x, y, rays_x, rays_y = (places.take(indices, axis=0) for places in (x, y, rays_x, rays_y))
     rho, sigma = inverse_depths(pose.R, pose.t, rays_x, rays_y)
-    slopes = slopes_of_all(x, rho, ALGORITHM_TUNING.depth_noise / K[0, 0] * sigma)
+    slopes = slopes_of_all(x, rho, _DEPTH_NOISE / K[0, 0] * sigma)
     slanted = warp.take(indices, axis=0) + slant_warp(K, pose.t, y, ratio[indices], slopes)
     slant_ok = has_moderate_stretch(slanted)
     warp[indices[slant_ok]] = slanted[slant_ok]

@@ -18,7 +18,7 @@ from djet_ros.core.jet import (
     Residuals,
     Solution,
 )
-from djet_ros.core.medians import median, quantile
+from djet_ros.core.medians import quantile
 from djet_ros.core.rivals import (
     preferences,
     PreviousMotion,
@@ -222,9 +222,7 @@ def _is_pure_rotation(problem: JetProblem, parallax: float) -> bool:
     rays_x, rays_y = problem.rays_x.T, problem.rays_y.T
     rotated = rays_x @ fit_rotation(rays_x, rays_y).T
     offsets = norms(rotated[:, :2] / rotated[:, 2:] - rays_y[:, :2])
-    # Size of a pixel in viewing-ray units, as for a surface of typical sharpness.
-    pixel = np.sqrt(median(np.abs(problem.covariances[0] + problem.covariances[2])) / 2)
-    return bool(quantile(offsets, 0.75) < parallax * pixel)
+    return bool(quantile(offsets, 0.75) < parallax * problem.pixel)
 
 
 def basin_of(problem: JetProblem, pose: Pose) -> Basin:

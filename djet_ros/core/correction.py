@@ -101,7 +101,7 @@ def turn_of_deviating_camera(rays_x: Array, rays_y: Array, sigmas: Array, rounds
     Returns R, and the distances (N,) of y from where it brings x, in units of the focal length.
     Robust as `fit_rotation`.
     """
-    x, y = (rays[:, :2] / rays[:, 2:] for rays in (rays_x, rays_y))
+    x, y = (one[:, :2] / one[:, 2:] for one in (rays_x, rays_y))
     R, deviation, by_x = fit_rotation(rays_x, rays_y), np.zeros(OF_CAMERA), displacements(x)
     prior = np.diag(np.append(np.zeros(3), 1 / sigmas**2))
     for _ in range(rounds):

@@ -40,16 +40,12 @@ _FROM_SCALE = np.array([0, _SMALL_CELLS, _SMALL_CELLS + 1, _SMALL_CELLS + 2])
 _DECAYS = np.where(np.arange(_SIDE_COUNT - 1) < _FROM_SCALE[:, None], 0.0,
                    _DECAY**(np.arange(_SIDE_COUNT - 1.0) - _FROM_SCALE[:, None]))
 
-# 99.9 % quantile of chi^2 with five degrees of freedom.
-CHI2_999 = 20.5
-
-# 95 % quantile of the same.
-_CHI2_95 = float(chdtri(5, 0.05))
-
 # Confidence at which bounds are those of Fisher's F of (5, v) in place of chi^2; it is the highest
 # that is promised.
 _CONFIDENCE = 0.999
-_CHI2_CONFIDENCE = float(chdtri(5, 1 - _CONFIDENCE))
+
+# Quantiles of chi^2 with five degrees of freedom.
+CHI2_999, _CHI2_95 = float(chdtri(5, 1 - _CONFIDENCE)), float(chdtri(5, 0.05))
 
 # chosen: factor by which heavy tails reduce the degrees of freedom of a variance estimate; 1.5 for
 # a kurtosis of 4 in place of 3.
@@ -456,7 +452,7 @@ def _small_sample_widening(cells: _Cells, growth: float) -> Array:
     few, axes = np.linalg.eigh(_KURTOSIS_FACTOR * np.sqrt(growth) * (shares.T @ shares))
     # At least one degree of freedom.
     freedom = 5 / np.clip(few, 1e-9, 5.0)
-    wider = 5 * fdtri(5, freedom, _CONFIDENCE) / _CHI2_CONFIDENCE
+    wider = 5 * fdtri(5, freedom, _CONFIDENCE) / CHI2_999
     turned = root @ axes
     return np.asarray((turned * (wider - 1)) @ turned.T)
 

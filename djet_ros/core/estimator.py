@@ -26,7 +26,7 @@ from djet_ros.core.jet import robust_scale
 from djet_ros.core.masks import blocked, Mask
 from djet_ros.core.matching import match_predicted, match_widely, Matches, MIN_RIGID_SHARE
 from djet_ros.core.memory import keep_freed_memory
-from djet_ros.core.pair import Limits, Observer, Pair
+from djet_ros.core.pair import Observer, Pair
 from djet_ros.core.parallel import run_both
 from djet_ros.core.radial import undistort_image
 from djet_ros.core.rivals import MIN_BODY_SHARE, PreviousMotion
@@ -53,6 +53,7 @@ from djet_ros.core.types import (
     RelativePose,
     require_gray,
     Status,
+    TRACKED,
     View,
 )
 from djet_ros.core.verdict import verdict, with_left_out
@@ -134,11 +135,10 @@ class TwoViewEstimator:
             predicted = match_predicted(previous, current, prior, known, self.config.search_radius)
         if predicted is not None and prior is not None:
             (x, y), bits, motion = predicted
-            limits = _limits_from(prior)
             result = self._estimate_followed(Pair(
-                previous, current, x, y, _previous_motion(prior), known, motion, limits, bits,
+                previous, current, x, y, _previous_motion(prior), known, motion, bits,
                 sought=len(previous.features), timings=timings), prior)
-            if _within_limits(result, limits):
+            if _fits_as_well(result, prior):
                 return result
 
         # Otherwise match in the whole search radius.
@@ -169,9 +169,8 @@ class TwoViewEstimator:
             return self.estimate_pair(pair)
         left_out = LeftOut(alone, pair.current.K)
         if left_out.is_world():
-            return self.estimate_pair(
-                replace(pair, prior=None, predicted=None, limits=Limits()))
-        reliable = _within_limits(alone, _limits_from(prior))
+            return self.estimate_pair(replace(pair, prior=None, predicted=None))
+        reliable = _fits_as_well(alone, prior)
         alone = replace(alone, left_out=~alone.of_body & ~left_out.readmitted())
         return self._of_followed_or_all(pair, alone, reliable)
 
@@ -267,7 +266,7 @@ class TwoViewEstimator:
         if track is None:
             return _failed(Status.TOO_FEW_MATCHES, pair)
         if track.attached is not None:
-            return self.estimate_pair(replace(pair.without(track.attached), limits=Limits()))
+            return self.estimate_pair(pair.without(track.attached))
 
         # Sign of t, covariance, status.
         result = self._verdict(pair, track)
@@ -366,21 +365,15 @@ def _failed(status: Status, pair: Pair) -> RelativePose:
     return RelativePose(status, x=pair.x, y=pair.y, timings=pair.timings)
 
 
-def _limits_from(prior: RelativePose) -> Limits:
+def _fits_as_well(result: RelativePose, prior: RelativePose) -> bool:
     """
-    Return the limits on a pair that is predicted by its prior: noise and share of inliers.
+    Return whether a pair has a motion that its matches fit about as well as those of the prior.
 
-    Most matches have to agree: with another moving body, the prior may be a compromise already.
+    Most of them have to agree: with another moving body, the prior may be a compromise already.
     """
-    noise = max(robust_scale(prior.residuals[prior.of_body]), _MIN_NOISE)
-    return Limits(_MAX_NOISE_GROWTH * noise, MIN_RIGID_SHARE)
-
-
-def _within_limits(result: RelativePose, limits: Limits) -> bool:
-    """Return whether a pair has a reliable status and is within limits."""
-    return (result.status in (Status.OK, Status.NO_PARALLAX)
-            and robust_scale(result.residuals[result.of_body]) < limits.max_noise
-            and result.inliers[result.of_body].mean() > limits.min_agreeing)
+    before, now = (robust_scale(pair.residuals[pair.of_body]) for pair in (prior, result))
+    return (result.status in TRACKED and now < _MAX_NOISE_GROWTH * max(before, _MIN_NOISE)
+            and result.inliers[result.of_body].mean() > MIN_RIGID_SHARE)
 
 
 def _previous_motion(prior: RelativePose | None) -> PreviousMotion | None:

@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 # Generators of SO(3), (3, 3, 3): [e_i]_x.
 GENERATORS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1)
 
-# rad^2; of a five-hundredth of a pixel, far below any noise: a unit beside its inverse, times the
-# number of matches, is not lost in rounding.
+# rad^2; least variance of a match, of a five-hundredth of a pixel and far below any noise. Beside
+# its inverse times the number of matches, a prior information of one is not lost in rounding.
 _LEAST_SQUARE = 1e-11
 
 # Takes the trace of a rotation (9,), and the vector (3,) of its antisymmetric part.
@@ -202,7 +202,7 @@ def turn_before_plane(rays_x: Array, rays_y: Array, rounds: int = 5) -> tuple[Ar
     Prazdny, 1980). What the image does not determine is less than one radian, one depth, and a
     slope of one. Robust as `fit_rotation`. rays_x, rays_y: (N, 3), nearly the same.
     """
-    (x, y), seen = ((rays[:, :2] / rays[:, 2:]).T for rays in (rays_x, rays_y))
+    (x, y), seen = ((towards[:, :2] / towards[:, 2:]).T for towards in (rays_x, rays_y))
     one, none = np.ones_like(x), np.zeros_like(x)
     by_turn = np.concatenate(displaced_by_turn(x, y), axis=1)
     by_shift = np.concatenate([[one, none, -x], [none, one, -y]], axis=1)

@@ -90,6 +90,11 @@ class JetProblem:
                           np.linalg.det(A)**2 * self.blur)
 
     @property
+    def pixel(self) -> float:
+        """Return one unit of the residuals in units of rays, for a surface of median curvature."""
+        return float(np.sqrt(median(np.abs(self.covariances[0] + self.covariances[2])) / 2))
+
+    @property
     def matches(self) -> tuple[Array, Array, Array, Array]:
         """Return all arrays of the problem."""
         return self.rays_x, self.rays_y, self.covariances, self.blur

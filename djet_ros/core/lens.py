@@ -26,6 +26,7 @@ from djet_ros.core.estimator_config import EstimatorConfig
 from djet_ros.core.geometry import essential, fit_rotation, inverses, rays, rotation_log, unit
 from djet_ros.core.jet import (
     clipped_scale,
+    entries,
     epipolar_residuals,
     JetProblem,
     LEAST_CURVATURE,
@@ -69,9 +70,6 @@ _RADIUS_SHARE, _MAX_AREA_RATIO = 0.01, 1.25
 
 # Step of k1 for numerical derivatives.
 _STEP = 1e-4
-
-# Scale of the robust loss in standard deviations, as in the odometry.
-_LOSS_SCALE = 3.0
 
 # Pixels; lower bound of the noise, for exact matches.
 _LEAST_NOISE = 1e-4
@@ -162,11 +160,6 @@ class LensFit:
     linearised: tuple[Linearised, ...]
     disagreement: float
 
-    @property
-    def noise(self) -> float:
-        """Return the median distance of matches from their epipolar lines, in pixels."""
-        return float(np.median([one.noise for one in self.linearised]))
-
 
 def fit_lens(pairs: Sequence[MatchedPair], lens: Lens) -> LensFit | None:
     """
@@ -231,7 +224,7 @@ def linearise(pair: MatchedPair, lens: Lens, k1: float) -> Linearised:
     problem, by_pixel = _problem(pair, lens, k1)
     R, t = pair.pose.R, pair.pose.t
     noise = max(clipped_scale(epipolar_residuals(problem, R, t).r), _LEAST_NOISE)
-    loss = Loss('geman_mcclure', _LOSS_SCALE * noise)
+    loss = Loss(EstimatorConfig.loss, EstimatorConfig.loss_scale * noise)
     solution = minimise(problem, R, t, loss)
     r = solution.residuals.r
     weights = loss(r * r)[1]
@@ -273,8 +266,7 @@ def _problem(pair: MatchedPair, lens: Lens, k1: float) -> tuple[JetProblem, Arra
     """
     x, _ = _undistorted(pair.x, lens, k1)
     y, by_pixel = _undistorted(pair.y, lens, k1)
-    S = by_pixel @ by_pixel.transpose(0, 2, 1)
-    spread = np.stack([S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]])
+    spread = entries(by_pixel @ by_pixel.transpose(0, 2, 1))
     width = (spread[0] + spread[2]) / 2
     rays_x, rays_y = (np.vstack([one.T, np.ones(len(one))]) for one in (x, y))
     blur = EstimatorConfig.epipole_blur**2 * width**2

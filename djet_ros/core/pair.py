@@ -30,19 +30,6 @@ class Round:
     optimum: Array
 
 
-@dataclass(frozen=True)
-class Limits:
-    """
-    Limits on a pair whose matches were predicted by the previous motion.
-
-    max_noise: bound of the robust standard deviation of the matches' distances from their epipolar
-    lines, in pixels; min_agreeing: share of the matches that have to agree.
-    """
-
-    max_noise: float = np.inf
-    min_agreeing: float = 0.0
-
-
 Observer = Callable[[Round], None]
 
 
@@ -54,12 +41,12 @@ class Pair:
     x, y: (N, 2) matched pixels of the previous and the current view, the most reliable first;
     prior: the previous motion; known: measurements from other sources than the images; predicted:
     a motion from which the matches were predicted, around which basins are sought in place of
-    other starts (t may be zeros); limits: the estimation gives up beyond these; bits: (N,)
-    descriptor distances at x and y, if known already; covariances: (N, 2, 2) of y up to a common
-    factor, which weight re-projection errors, all alike if None; sought: number of features that
-    were searched, see ``RelativePose``; outliers: number of matches removed before as outliers of
-    a starting pose; start: the only one to start from, if the basin is known; observe: called with
-    each round of Algorithm 1; timings: receives the seconds of each stage.
+    other starts (t may be zeros); bits: (N,) descriptor distances at x and y, if known already;
+    covariances: (N, 2, 2) of y up to a common factor, which weight re-projection errors, all alike
+    if None; sought: number of features that were searched, see ``RelativePose``; outliers: number
+    of matches removed before as outliers of a starting pose; start: the only one to start from, if
+    the basin is known; observe: called with each round of Algorithm 1; timings: receives the
+    seconds of each stage.
     """
 
     previous: View
@@ -69,7 +56,6 @@ class Pair:
     prior: PreviousMotion | None = None
     known: KnownMotion = field(default_factory=KnownMotion)
     predicted: PreviousMotion | None = None
-    limits: Limits = field(default_factory=Limits)
     bits: Array | None = None
     covariances: Array | None = None
     sought: int = 0

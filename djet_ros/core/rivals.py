@@ -8,7 +8,7 @@ half of the image, each half has its own motion.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 from djet_ros.core.cells import sum_by_cell
@@ -20,9 +20,9 @@ from djet_ros.core.geometry import (
     rotation_angle,
     unit,
 )
-from djet_ros.core.jet import clipped_scale, JetProblem, Loss, robust_scale
+from djet_ros.core.jet import clipped_scale, epipolar_residuals, JetProblem, Loss, robust_scale
 from djet_ros.core.medians import median
-from djet_ros.core.sketch import losses_in_front, refine_all, Sketch
+from djet_ros.core.sketch import losses_in_front, refine_all
 from djet_ros.core.starts import starts_around, subsampled
 from djet_ros.core.types import Array, Pose, RelativePose, Rival
 import numpy as np
@@ -91,21 +91,15 @@ class SecondMotion:
     """
     Two motions in one pair, t of both with the sign that brings their points in front.
 
-    first: the motion with most inliers; pose: the other one; members: (N,) bool, inliers of that;
+    motions: the one with most inliers, and the other one; members: (N,) bool, inliers of that;
     width: the area over which its exclusive inliers spread, over that of the exclusive inliers of
-    the first; flatness: near over far depth of the first and the other, NaN if hidden by noise.
+    the first; flatness: near over far depth of both, NaN if hidden by noise.
     """
 
-    first: Pose
-    pose: Pose
+    motions: tuple[Pose, Pose]
     members: NDArray[np.bool_]
     width: float
     flatness: tuple[float, float]
-
-    @property
-    def motions(self) -> tuple[Pose, Pose]:
-        """Both motions, the first one first."""
-        return self.first, self.pose
 
 
 def pose_distance(one: Pose, other: Pose) -> float:
@@ -269,23 +263,23 @@ def second_motion(problem: JetProblem, places: Array, first: Pose, scale: float,
     the same lines with the opposite direction. None if there are few outliers, or if no more than
     half of them agree: false matches that are off by a few pixels agree with many motions.
     """
-    lines = refine_all(problem, [first], Loss(), 0)
-    first = _with_chirality(problem, first, np.abs(lines.r[0]) < INLIER * scale)
-    scale = min(max(robust_scale(lines.r[0]), scale), 3 * scale)
-    distances = _distances(problem, replace(lines, t=first.t[None]))
+    residuals = epipolar_residuals(problem, first.R, first.t).r
+    first = _with_chirality(problem, first, np.abs(residuals) < INLIER * scale)
+    scale = min(max(robust_scale(residuals), scale), 3 * scale)
+    distances = _distances(problem, first)
     outliers = np.flatnonzero(distances > OUTLIER * scale)
     least = max(least, round(MIN_BODY_SHARE * (distances < INLIER * scale).sum()))
     if len(outliers) < least:
         return None
     pose = fit_motion(problem.subset(outliers), first, scale)
-    members = _distances(problem, refine_all(problem, [pose], Loss(), 0)) < INLIER * scale
+    members = _distances(problem, pose) < INLIER * scale
     agreeing = members[outliers].sum()
     if agreeing < least or agreeing <= len(outliers) / 2:
         return None
-    exclusive = _exclusive(distances, members, scale)
-    only_first, only_second = (places[each] for each in exclusive)
-    return SecondMotion(first, pose, members, _area(only_second) / max(_area(only_first), 1e-9),
-                        _flatness_of_both(problem, (first, pose), exclusive))
+    motions, exclusive = (first, pose), _exclusive(distances, members, scale)
+    first_area, second_area = (_area(places[each]) for each in exclusive)
+    return SecondMotion(motions, members, second_area / max(first_area, 1e-9),
+                        _flatness_of_both(problem, motions, exclusive))
 
 
 def _exclusive(distances: Array, members: NDArray[np.bool_], scale: float
@@ -321,8 +315,7 @@ def static_by_depth(flatness: tuple[float, float]) -> int | None:
 
 def is_static_world(problem: JetProblem, one: Pose, other: Pose, scale: float) -> bool:
     """Return whether depths tell that one of two motions is the camera's: `static_by_depth`."""
-    distances, to_other = (
-        _distances(problem, refine_all(problem, [pose], Loss(), 0)) for pose in (one, other))
+    distances, to_other = (_distances(problem, pose) for pose in (one, other))
     exclusive = _exclusive(distances, to_other < INLIER * scale, scale)
     return static_by_depth(_flatness_of_both(problem, (one, other), exclusive)) == 0
 
@@ -359,10 +352,10 @@ def motion_without_attached(problem: JetProblem, fixed: NDArray[np.bool_], pose:
     moving = problem.subset(~fixed)
     motion = fit_motion(moving, pose, scale)
     # Matches that stay in place are less noisy than those that move.
-    scale = max(clipped_scale(refine_all(moving, [motion], Loss(), 0).r[0]), scale)
+    scale = max(clipped_scale(epipolar_residuals(moving, motion.R, motion.t).r), scale)
     tight = refine_all(moving, [motion], Loss('geman_mcclure', INLIER * scale), _STEPS)
     motion = _with_chirality(moving, tight.pose(0), np.abs(tight.r[0]) < INLIER * scale)
-    distances = _distances(problem, refine_all(problem, [motion], Loss(), 0))
+    distances = _distances(problem, motion)
     agree = distances[~fixed] < INLIER * scale
     attached = (distances[fixed] > OUTLIER * scale).sum()
     if agree.mean() <= 0.5 or attached < least or attached <= fixed.sum() / 2:
@@ -393,7 +386,7 @@ def may_stand(problem: JetProblem, shift: Array, pose: Pose, focal: float, noise
             or between >= MAX_SLIGHTLY * standing
             or (prior is not None and pose_distance(prior, pose) < _MAX_CHANGE)):
         return False
-    agree = _distances(problem, refine_all(problem, [pose], Loss(), 0)) < INLIER * noise
+    agree = _distances(problem, pose) < INLIER * noise
     return not _flatness(problem.subset(np.flatnonzero(agree & moving)), pose) < DEEP_RATIO
 
 
@@ -417,12 +410,9 @@ def _log_choose(n: int, k: int) -> float:
     return float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))
 
 
-def _distances(problem: JetProblem, lines: Sketch) -> Array:
-    """
-    Distances (N,) of matches from their epipolar half-lines, in units of the residuals.
-
-    lines: a pose, with the residuals to its lines, which do not depend on the sign of t.
-    """
+def _distances(problem: JetProblem, pose: Pose) -> Array:
+    """Return the distances (N,) of matches from their epipolar half-lines, as residuals."""
+    lines = refine_all(problem, [pose], Loss(), 0)
     # Indefinite surfaces that are kept as printed have losses below 0.
     return np.asarray(np.sqrt(np.abs(losses_in_front(problem, lines, Loss(), signs=(1.0,))[0])))
 
@@ -437,12 +427,10 @@ def _flatness(problem: JetProblem, pose: Pose) -> float:
     """Return the near over the far depth of a body's points, NaN if noise hides it."""
     if not len(problem.blur):
         return float('nan')
-    noise = robust_scale(refine_all(problem, [pose], Loss(), 0).r[0])
+    noise = robust_scale(epipolar_residuals(problem, pose.R, pose.t).r)
     rho, sigma = inverse_depths(pose.R, pose.t, problem.rays_x.T, problem.rays_y.T)
-    # One unit of the residuals in viewing-ray units, for a match of typical sharpness.
-    pixel = np.sqrt(np.median(np.abs(problem.covariances[0] + problem.covariances[2])) / 2)
     far, near = np.quantile(rho, (_FAR_QUANTILE, _NEAR_QUANTILE))
-    blurred = near <= 0 or noise * pixel * np.median(sigma) > _MAX_DEPTH_NOISE * near
+    blurred = near <= 0 or noise * problem.pixel * np.median(sigma) > _MAX_DEPTH_NOISE * near
     return float('nan') if blurred else float(max(far / near, 0.0))
 
 

@@ -170,14 +170,14 @@ class DescriptorSurface(_ImageSurface):
             surfaces, centres[stale] + self._offset[stale], self._config.window_sigma))
 
     def _contrast_around(self, y: NDArray[Any], usable: NDArray[np.bool_]) -> float:
-        """Estimate the contrast ratio at the initial matches, once."""
+        """Estimate the contrast ratio at the initial matches, once: exposure changes it."""
         if self._contrast is None:
             chosen = np.flatnonzero(usable)
             chosen = chosen[subsampled(len(chosen), _CONTRAST_MATCHES)]
-            self._contrast = self._distances.contrast(
-                self._previous.surface_gray, np.rint(self.x[chosen]).astype(np.int64),
-                self._current,
-                np.rint(y[chosen]).astype(np.int64))
+            self._contrast = contrast_ratio(*(
+                self._distances.strengths(image, np.rint(places[chosen]).astype(np.int64))
+                for image, places in ((self._current, y),
+                                      (self._previous.surface_gray, self.x))))
         return self._contrast
 
     def _merged(self, stale: NDArray[np.bool_], usable: NDArray[np.bool_], y: Array,
@@ -210,19 +210,12 @@ class DescriptorDistances:
         """Return a mask (N,) of the points with a descriptor at every pixel within `radius`."""
         return describable(np.rint(points).astype(np.int64), shape, radius, self._tests)
 
-    def contrast(self, previous: NDArray[Any], x: Pixels, current: NDArray[Any], y: Pixels
-                 ) -> float:
-        """
-        Return the contrast of the current image around y (N, 2) over the previous around x (N, 2).
-
-        A change of exposure changes it. Binary tests are invariant to contrast: 1.
-        """
-        subset = subsampled(len(x), _CONTRAST_MATCHES)
-        return contrast_ratio(self.strengths(current, y[subset]),
-                              self.strengths(previous, x[subset]))
-
     def strengths(self, image: NDArray[Any], points: Pixels) -> Array:
-        """Return the texture strength (N,) around whole pixels (N, 2), see ``contrast_ratio``."""
+        """
+        Return the texture strength (N,) around whole pixels (N, 2), see ``contrast_ratio``.
+
+        One for binary tests, which are invariant to contrast.
+        """
         if not self._grading:
             return np.ones(len(points))
         p, q = intensities(image, points, self._tests[:_CONTRAST_TESTS])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from djet_ros.core.algorithm import Algorithm, ALGORITHM_TUNING, Track
+from djet_ros.core.algorithm import Algorithm, Track
 from djet_ros.core.basins import BASIN_TUNING, better_by_parts, likeliest
 from djet_ros.core.bodies import continuing_motion
 from djet_ros.core.estimator_config import EstimatorConfig
@@ -19,6 +19,7 @@ from djet_ros.core.jet import Loss
 from djet_ros.core.pair import Pair
 from djet_ros.core.rivals import (
     continues_motion,
+    INLIER,
     is_planar,
     motion_without_attached,
     planar_twin,
@@ -48,12 +49,11 @@ def track_jointly(pair: Pair, surface: ResidualSurface, starts: list[Pose],
     surface: residual surfaces on the matches of the pair. Without starts, basins are sought around
     the predicted motion of the pair; the keypoints were tracked from its prediction, accurately
     enough for round one to use re-projection errors in place of surfaces. A single start is
-    optimised as it is. None if too few matches have a usable surface, or if the pair exceeds its
-    limits.
+    optimised as it is. None if too few matches have a usable surface.
     """
     predicted = None if starts else pair.predicted
     algorithm = Algorithm(pair, surface, config)
-    track = algorithm.run(starts, predicted, pair.limits)
+    track = algorithm.run(starts, predicted)
     if track is None or len(starts) == 1:
         return track
 
@@ -172,7 +172,7 @@ def _attached_to_camera(algorithm: Algorithm, track: Track, noise: float
     pair, first, measured = algorithm.pair, algorithm.first, algorithm.pair.known.rotation
     if pair.known.stood:
         return None
-    fixed = norms(pair.y - pair.x) < ALGORITHM_TUNING.inlier * noise
+    fixed = norms(pair.y - pair.x) < INLIER * noise
     world = motion_without_attached(first.problem, fixed[first.voting], track.pose, noise,
                                     algorithm.config.min_matches, pair.prior)
     if world is None or (measured is not None and measured.prefers(track.pose.R, world.R)):
@@ -219,7 +219,7 @@ def _camera_of_two_motions(algorithm: Algorithm, track: Track, noise: float) -> 
     if camera == 1:
         members = np.zeros(len(pair.y), bool)
         members[first.voting] = second.members
-        track = algorithm.rerun(second.pose, alive=members) or track
+        track = algorithm.rerun(second.motions[1], alive=members) or track
     if decided is None:
         other = second.motions[1 - camera]
         return replace(track, rivals=(Rival(other, 0.0),), body_ambiguous=True)

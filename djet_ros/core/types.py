@@ -175,15 +175,16 @@ class RelativePose:
     The estimated motion between two frames, ``x_current = R x_previous + t``, and its evidence.
 
     R: (3, 3) rotation; t: (3,) unit direction, or zeros if the translation is not determined
-    (status NO_PARALLAX and all failures). Three statuses come with a best guess whose covariance
-    spans the alternatives: AMBIGUOUS if a very different motion explains the matches as well;
-    TWO_MOTIONS if two bodies move and nothing decides which of them is the static world, if the
-    camera may stand still while one passes, or if one has come to fill the view;
-    TOO_FEW_INLIERS if false matches could produce as many inliers. covariance_5: (5, 5) over
-    (rotation vector in rad, arc of t in rad in the basis ``sphere_tangents(t)``);
-    covariance_6: (6, 6) over (rotation vector, t), of rank 5 because t has unit length. If t is
-    zeros, only the rotation blocks (3, 3) are meaningful: the rest belongs to the direction that
-    was fitted first, which is not determined.
+    (status NO_PARALLAX and all failures). Three statuses come with a best guess: AMBIGUOUS if a
+    very different motion explains the matches as well; TWO_MOTIONS if two bodies move and nothing
+    decides which of them is the static world, if the camera may stand still while one passes, or
+    if one has come to fill the view; TOO_FEW_INLIERS if false matches could produce as many
+    inliers. Covariances of the first two span the alternatives, or are NaN if evidence from
+    outside of the pair contradicts it; those of the last take the inliers to be true.
+    covariance_5: (5, 5) over (rotation vector in rad, arc of t in rad in the basis
+    ``sphere_tangents(t)``); covariance_6: (6, 6) over (rotation vector, t), of rank 5 because t
+    has unit length. If t is zeros, only the rotation blocks (3, 3) are meaningful: the rest
+    belongs to the direction that was fitted first, which is not determined.
 
     x, y: (N, 2) matched pixels in the previous and the current image, as used; y_opt: (N, 2) y
     after its final step onto the epipolar line; inliers: (N,) bool; voting: (N,) bool, matches

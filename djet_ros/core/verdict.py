@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from djet_ros.core.algorithm import ALGORITHM_TUNING, Track
+from djet_ros.core.algorithm import Track
 from djet_ros.core.correction import turn_of_deviating_camera
 from djet_ros.core.covariance import (
     calibration_covariance,
@@ -41,6 +41,7 @@ from djet_ros.core.patches import unaligned
 from djet_ros.core.rivals import (
     continues_motion,
     false_alarms,
+    INLIER,
     may_stand,
     pose_distance,
     preferences,
@@ -59,8 +60,9 @@ _RANDOM_BITS = 112
 # Factor by which parallax has to exceed the noise of the matches.
 _PARALLAX_OVER_NOISE = 3.0
 
-# And factor beyond which that noise is no part of the information about t, to 5 % of nearly all
-# standard deviations in rendered and real scenes: the share falls with the square.
+# And factor beyond which noise along the epipolar lines, which passes for parallax, may count as
+# information about t: its share falls with the square, and is below 5 % of nearly all standard
+# deviations in rendered and real scenes.
 _FAR_OVER_NOISE = 50.0
 
 # chosen: factor by which preferences overstate the evidence, as neighbouring cells have correlated
@@ -245,7 +247,7 @@ def _false_alarm(pair: Pair, track: Track, agreeing: int, config: EstimatorConfi
     count as tested too.
     """
     radius = min(config.search_radius, 0.5) * max(pair.current.gray.shape)
-    chance = 4 * ALGORITHM_TUNING.inlier * track.scale / (np.pi * radius)
+    chance = 4 * INLIER * track.scale / (np.pi * radius)
     return false_alarms(agreeing, len(track.voting) + pair.outliers, chance) > 0
 
 
