@@ -54,7 +54,7 @@ class Graph:
         return SimpleNamespace(publish=lambda message: True, listeners=0)
 
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None], profile: Profile,
-               ready: Callable[[], bool] | None = None) -> Any:
+               ready: Callable[[], bool] | None = None, *, many: bool = False) -> Any:
         self.callbacks[topic], self.kinds[topic] = callback, kind
         self.taken.append(topic)
         return SimpleNamespace(topic=topic, profile=profile, new_losses=lambda: 0,

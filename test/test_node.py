@@ -39,6 +39,7 @@ from ros_messages import (
     SEEN,
     serialised,
 )
+from scipy.spatial.transform import Rotation
 
 pytestmark = [pytest.mark.ros, pytest.mark.skipif(
     find_spec('rclpy') is None, reason='rclpy is missing: no ROS 2 is sourced here')]
@@ -156,10 +157,11 @@ def filmed(images: list[Any], folder: Path) -> FrameSequence:
 
 
 @pytest.mark.parametrize(('base_frame', 'imu'), [
-    ('', False), ('base_link', False), ('', True)], ids=['camera', 'base_frame', 'imu'])
+    ('', ''), ('base_link', ''), ('', 'from tf'), ('', 'as given')],
+    ids=['camera', 'base_frame', 'imu', 'imu_rotation'])
 def test_live_poses_equal_those_of_djet_replay_bit_for_bit(
         node, publisher, subscriber, drive, tmp_path, base_frame, imu):
-    if base_frame or imu:
+    if base_frame or imu == 'from tf':
         pytest.importorskip('tf2_ros', reason='tf2_ros_py is not installed')
     mounting = MAKE.frame(0, 'base_link', 'camera', AHEAD)
     sequence = filmed(drive, tmp_path / 'images')
@@ -169,8 +171,11 @@ def test_live_poses_equal_those_of_djet_replay_bit_for_bit(
         for one in plain.messages():
             whole.write(one.topic, one.message, one.stamp_ns)
     parameters = tmp_path / 'fast.yaml'
+    rotation = (Rotation.from_matrix(sequence.imu.to_camera).as_quat().tolist()
+                if imu == 'as given' else '""')
     parameters.write_text('/**: {ros__parameters: {estimator: {max_features: 600}, odometry: '
-                          f'{{base_frame: "{base_frame}", imu: {str(imu).lower()}}}}}}}')
+                          f'{{base_frame: "{base_frame}", imu: {str(bool(imu)).lower()}, '
+                          f'imu_rotation: {rotation}}}}}}}')
     replay = subprocess.run(
         [sys.executable, '-c', 'from djet_ros.cli.main import main; raise SystemExit(main())',
          'replay', tmp_path / 'bag', '--output', tmp_path / 'out', '--config', parameters],

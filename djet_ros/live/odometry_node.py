@@ -60,11 +60,12 @@ class OdometryNode(LiveNode):
                 self.listen(self._middleware.resolve(topic), AUXILIARY_TYPES[topic],
                             getattr(self.session, topic),
                             replace(input_profile(config.ros),
-                                    depth=_MASKS_DEPTH if topic == 'mask' else _DEPTH))
+                                    depth=_MASKS_DEPTH if topic == 'mask' else _DEPTH),
+                            many=topic == 'imu')
                 self._auxiliary_topics.add(topic)
         if odometry.guess_by_tf and not self._guess_tf_subscribed:
             self.listen(self._middleware.resolve(TF), TF_TYPE, self.session.tf,
-                        replace(input_profile(config.ros), depth=_DEPTH))
+                        replace(input_profile(config.ros), depth=_DEPTH), many=True)
             self.listen(self._middleware.resolve(TF_STATIC), TF_TYPE, self.session.tf_static,
                         FRAMES_PROFILE, as_configured=False)
             self._guess_tf_subscribed = True
