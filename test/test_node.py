@@ -679,7 +679,7 @@ BROKEN_YAML = '/**: {ros__parameters: {estimator: '
     (['-p', 'qos_overrides./image.subscription.reliability:=maybe'],
      "/image does not accept qos_overrides./image.* = {'subscription.reliability': 'maybe'"),
     (['-p', 'qos_overrides./image.subscription.depth:=many'],
-     "{'subscription.depth': 'many'"),
+     '}: a value has the wrong type'),
 ])
 def test_user_error_ends_the_node_with_one_line_and_exit_code_2(tmp_path, arguments, reason):
     (tmp_path / 'broken.yaml').write_text(BROKEN_YAML)

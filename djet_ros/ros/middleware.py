@@ -277,8 +277,10 @@ def _report_bad_overrides(node: Node, topic: str) -> Iterator[None]:
     except (AssertionError, RuntimeError, TypeError, ValueError) as error:
         overrides = {name: one.value for name, one
                      in node.get_parameters_by_prefix(f'qos_overrides.{topic}').items()}
+        # That of an assertion is empty.
+        why = one_line(error) if str(error) else 'a value has the wrong type'
         raise DjetError(f'{topic} does not accept qos_overrides.{topic}.* = {overrides}: '
-                        f'{one_line(error) or "a value has the wrong type"}') from error
+                        f'{why}') from error
 
 
 def _qos(profile: Profile) -> QoSProfile:
