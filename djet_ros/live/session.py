@@ -70,6 +70,7 @@ class Session:
     def __init__(self, tracker: Tracker, wiring: Wiring, topics: Mapping[str, str]) -> None:
         node = tracker.config.ros
         self._tracker = tracker
+        tracker.node_values, tracker.node_complaints = self._node_values, self._node_complaints
         self._wiring = wiring
         self._topics = topics
         self._queue: FrameQueue[_Received] = FrameQueue(
@@ -285,7 +286,6 @@ class Session:
     def _process(self, received: _Received) -> None:
         tracker = self._tracker
         self._count_drops()
-        self._update_node_diagnostics()
         self._take_info(received.info)
         self._auxiliary.feed(tracker, self._auxiliary_cutoff(received))
         frame = frame_of(received.image.header)
@@ -372,15 +372,12 @@ class Session:
             self._publish(self._tracker.camera_info(info))
             self._log_problem()
 
-    def _update_node_diagnostics(self) -> None:
-        self._tracker.node_values = self._node_values()
+    def _node_complaints(self) -> list[Complaint]:
         waiting = self._queue.weight
         # Warn before anything is lost.
-        self._tracker.node_complaints = [] if waiting < MAX_QUEUE_BYTES / 2 else [Complaint(
-            'images pile up', 'WARN', (
-                f'{waiting * 1e-6:.0f} MB of images are queued; from '
-                f'{MAX_QUEUE_BYTES * 1e-6:.0f} MB on images are dropped, unless their publisher '
-                f'can wait; {REDUCE_LOAD}'))]
+        return [] if waiting < MAX_QUEUE_BYTES / 2 else [Complaint('images pile up', 'WARN', (
+            f'{waiting * 1e-6:.0f} MB of images are queued; from {MAX_QUEUE_BYTES * 1e-6:.0f} MB '
+            f'on images are dropped, unless their publisher can wait; {REDUCE_LOAD}'))]
 
     def _node_values(self) -> dict[str, str]:
         return {'frames lost on the way': str(self._lost),
@@ -396,7 +393,6 @@ class Session:
         self._wiring.publish(outgoing)
 
     def _publish_diagnostics(self) -> None:
-        self._update_node_diagnostics()
         self._publish([self._tracker.diagnostics(time_ns())])
 
     def _log_problem(self) -> None:
