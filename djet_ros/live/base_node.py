@@ -122,8 +122,8 @@ class LiveNode:
             return f'its type is {", ".join(sorted(kinds))}, not {wanted}' + (
                 _transport_remedy(kinds))
         if offers:
-            return (f'{len(offers)} publisher{"s" if len(offers) > 1 else ""}, but no messages '
-                    f'arrive{self._loss_remedy(topic, offers)}')
+            return (f'no messages arrive from {" and ".join(sorted({one.who for one in offers}))}'
+                    + self._loss_remedy(topic, offers))
         if _IMAGE in (wanted, *kinds) and self._middleware.publishers_of(f'{topic}/compressed'):
             return (f'it has no publisher, but {topic}/compressed has; set '
                     'ros.image_transport:=compressed')

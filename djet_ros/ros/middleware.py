@@ -30,6 +30,7 @@ from rclpy.qos import (
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.time import Time
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_srvs.srv import Trigger
 
 # Seconds between two checks for QoS events. Each publisher and subscription has two handlers of
@@ -43,6 +44,9 @@ _POLL_PERIOD = 0.01
 # History depth for queue_policy 'every'. ROS cannot bound KEEP_ALL: Cyclone DDS takes gigabytes,
 # and no publisher waits. It is enough until Python gets to run and takes the messages.
 _EVERY_DEPTH = 50
+
+# What the middleware calls the node of a publisher without one.
+_NO_NODE = ('_NODE_NAME_UNKNOWN_', '_CREATED_BY_BARE_DDS_APP_')
 
 _OVERRIDES = QoSOverridingOptions((QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
                                    QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY))
@@ -221,8 +225,7 @@ class RosMiddleware:
 
     def publishers_of(self, topic: str) -> list[PublisherInfo]:
         """Return the publishers of a topic."""
-        return [PublisherInfo(f'{one.node_namespace.rstrip("/")}/{one.node_name}', one.topic_type,
-                              _profile(one.qos_profile))
+        return [PublisherInfo(_name(one), one.topic_type, _profile(one.qos_profile))
                 for one in self._node.get_publishers_info_by_topic(topic)]
 
     def published(self, kind: str) -> list[str]:
@@ -281,6 +284,13 @@ def _report_bad_overrides(node: Node, topic: str) -> Iterator[None]:
         why = one_line(error) if str(error) else 'a value has the wrong type'
         raise DjetError(f'{topic} does not accept qos_overrides.{topic}.* = {overrides}: '
                         f'{why}') from error
+
+
+def _name(publisher: TopicEndpointInfo) -> str:
+    """Return the name of the node of a publisher, which has none if it is not a ROS node."""
+    if publisher.node_name in _NO_NODE:
+        return 'a publisher without a ROS node'
+    return f'{publisher.node_namespace.rstrip("/")}/{publisher.node_name}'
 
 
 def _qos(profile: Profile) -> QoSProfile:
