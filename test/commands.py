@@ -17,6 +17,11 @@ from djet_ros.cli.main import main
 UNSEEN = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
 
 
+def limit(seconds: float) -> float:
+    """Return a limit of time that is longer where more processes run than there are cores."""
+    return seconds * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
 @contextmanager
 def redirected(descriptor: int) -> Iterator[BinaryIO]:
     """Yield a file of all that is written to a descriptor, by libraries in C too."""

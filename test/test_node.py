@@ -13,6 +13,7 @@ from time import monotonic, sleep
 from typing import Any
 
 from cards import Cards, K, pose, SIZE
+from commands import limit
 import cv2
 from djet_ros.lab.scenes.imu import feel, Mems
 from djet_ros.odometry.messages import pose_of, stamp_ns
@@ -840,7 +841,7 @@ def test_signal_during_a_stream_ends_the_node_within_a_second(
     code, seconds = one.end(number)
     stream.join()
     assert code == 0
-    assert seconds < 1
+    assert seconds < limit(1)
     sleep(0.3)
     # Whole or not at all.
     assert len({len(subscriber.received[topic]) for topic in (
