@@ -23,6 +23,11 @@ DJET = (sys.executable, '-c', 'import sys; from djet_ros.cli.main import main; s
 UNSEEN = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
 
 
+def limit(seconds: float) -> float:
+    """Return a limit of time that is longer where more processes run than there are cores."""
+    return seconds * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
 @contextmanager
 def redirected(descriptor: int) -> Iterator[BinaryIO]:
     """Yield a file of all that is written to a descriptor, by libraries in C too."""

@@ -54,7 +54,7 @@ class Graph:
         return SimpleNamespace(publish=lambda message: True, listeners=0)
 
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None], profile: Profile,
-               ready: Callable[[], bool] | None = None) -> Any:
+               ready: Callable[[], bool] | None = None, *, many: bool = False) -> Any:
         self.callbacks[topic], self.kinds[topic] = callback, kind
         self.taken.append(topic)
         return SimpleNamespace(topic=topic, profile=profile, new_losses=lambda: 0,
@@ -179,8 +179,8 @@ def test_missing_images_are_logged_with_the_remedy_for_fragment_loss(
         node, asked, offered, remedy):
     one = node(**{'ros.qos_reliability': asked})
     one.graph.offered.update(dict.fromkeys(('/image', '/camera_info'), Profile(reliable=offered)))
-    assert one.node.why_silent('/image') == f'1 publisher, but no messages arrive{remedy}'
-    assert one.node.why_silent('/camera_info') == '1 publisher, but no messages arrive'
+    assert one.node.why_silent('/image') == f'no messages arrive from /sender{remedy}'
+    assert one.node.why_silent('/camera_info') == 'no messages arrive from /sender'
 
 
 @pytest.mark.parametrize(('transport', 'elsewhere', 'hint'), [

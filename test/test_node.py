@@ -13,6 +13,7 @@ from time import monotonic, sleep
 from typing import Any
 
 from cards import Cards, K, pose, SIZE
+from commands import limit
 import cv2
 from djet_ros.lab.scenes.imu import feel, Mems
 from djet_ros.odometry.messages import pose_of, stamp_ns
@@ -39,6 +40,7 @@ from ros_messages import (
     SEEN,
     serialised,
 )
+from scipy.spatial.transform import Rotation
 
 pytestmark = [pytest.mark.ros, pytest.mark.skipif(
     find_spec('rclpy') is None, reason='rclpy is missing: no ROS 2 is sourced here')]
@@ -157,10 +159,11 @@ def filmed(images: list[Any], folder: Path) -> FrameSequence:
 
 
 @pytest.mark.parametrize(('base_frame', 'imu'), [
-    ('', False), ('base_link', False), ('', True)], ids=['camera', 'base_frame', 'imu'])
+    ('', ''), ('base_link', ''), ('', 'from tf'), ('', 'as given')],
+    ids=['camera', 'base_frame', 'imu', 'imu_rotation'])
 def test_live_poses_equal_those_of_djet_replay_bit_for_bit(
         node, publisher, subscriber, drive, tmp_path, base_frame, imu):
-    if base_frame or imu:
+    if base_frame or imu == 'from tf':
         pytest.importorskip('tf2_ros', reason='tf2_ros_py is not installed')
     mounting = MAKE.frame(0, 'base_link', 'camera', AHEAD)
     sequence = filmed(drive, tmp_path / 'images')
@@ -170,8 +173,11 @@ def test_live_poses_equal_those_of_djet_replay_bit_for_bit(
         for one in plain.messages():
             whole.write(one.topic, one.message, one.stamp_ns)
     parameters = tmp_path / 'fast.yaml'
+    rotation = (Rotation.from_matrix(sequence.imu.to_camera).as_quat().tolist()
+                if imu == 'as given' else '""')
     parameters.write_text('/**: {ros__parameters: {estimator: {max_features: 600}, odometry: '
-                          f'{{base_frame: "{base_frame}", imu: {str(imu).lower()}}}}}}}')
+                          f'{{base_frame: "{base_frame}", imu: {str(bool(imu)).lower()}, '
+                          f'imu_rotation: {rotation}}}}}}}')
     replay = subprocess.run(
         [sys.executable, '-c', 'from djet_ros.cli.main import main; raise SystemExit(main())',
          'replay', tmp_path / 'bag', '--output', tmp_path / 'out', '--config', parameters],
@@ -231,8 +237,8 @@ def test_missing_inputs_are_logged_with_their_resolved_names(node, publisher, dr
         line = wait_for_log(one, f'waiting for {what} on {topic}: it has no publisher')
         assert 'did you mean' not in line
     publisher.advertise('/elsewhere/info', INFO_TYPE)
-    wait_for_log(one, 'waiting for camera_info on /elsewhere/info: 1 publisher, but no messages '
-                      'arrive')
+    wait_for_log(one, 'waiting for camera_info on /elsewhere/info: no messages arrive from '
+                      '/camera_driver')
 
 
 @pytest.mark.parametrize('case', SEEN)
@@ -675,7 +681,7 @@ BROKEN_YAML = '/**: {ros__parameters: {estimator: '
     (['-p', 'qos_overrides./image.subscription.reliability:=maybe'],
      "/image does not accept qos_overrides./image.* = {'subscription.reliability': 'maybe'"),
     (['-p', 'qos_overrides./image.subscription.depth:=many'],
-     "{'subscription.depth': 'many'"),
+     '}: a value has the wrong type'),
 ])
 def test_user_error_ends_the_node_with_one_line_and_exit_code_2(tmp_path, arguments, reason):
     (tmp_path / 'broken.yaml').write_text(BROKEN_YAML)
@@ -836,7 +842,7 @@ def test_signal_during_a_stream_ends_the_node_within_a_second(
     code, seconds = one.end(number)
     stream.join()
     assert code == 0
-    assert seconds < 1
+    assert seconds < limit(1)
     sleep(0.3)
     # Whole or not at all.
     assert len({len(subscriber.received[topic]) for topic in (

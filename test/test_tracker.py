@@ -854,7 +854,7 @@ def test_speeds_give_the_length(drive):
 def test_faces_add_their_counts_and_values(drive):
     one = tracker()
     one.count_dropped('queue_full', 3)
-    one.node_values['latency (ms)'] = '7.0'
+    one.node_values = lambda: {'latency (ms)': '7.0'}
     out = play(one, drive[:1])[0]
     statuses = values(out['/diagnostics'])
     assert statuses['frames received'] == '4'

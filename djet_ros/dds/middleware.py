@@ -75,8 +75,9 @@ class DdsMiddleware:
         return self._graph.advertise(topic, kind)
 
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
-               profile: Profile, ready: Callable[[], bool] | None = None) -> Subscription:
-        """Subscribe to a topic."""
+               profile: Profile, ready: Callable[[], bool] | None = None, *,
+               many: bool = False) -> Subscription:
+        """Subscribe to a topic; many is not used, as all messages are taken together."""
         # One message at a time if the next one may have to wait.
         return self._graph.listen(topic, kind, callback, profile, garbage=self._note_garbage,
                                   batch=100 if ready is None else 1, ready=ready)

@@ -8,16 +8,15 @@ from typing import Any, NamedTuple
 
 from djet_ros.live.frame_queue import FrameQueue
 from djet_ros.live.stopwatch import Moment, Stopwatch
-from djet_ros.odometry.tracker import Tracker
 
 # Messages in the queue: minutes of a fast IMU.
 _MAX_MESSAGES = 100_000
 
 
 class _Queued(NamedTuple):
-    """A message, the tracker's method for it, and its time of arrival."""
+    """A message, the tracker's method that takes it, and its time of arrival."""
 
-    what: str
+    take: Callable[[Any], None]
     message: Any
     at: Moment
 
@@ -36,29 +35,29 @@ class AuxiliaryQueue:
         self._arrived = Event()
         self.newest: Moment | None = None
 
-    def put(self, what: str, message: Any, size: int) -> None:
-        """Queue a message of some bytes for the tracker's method ``what``."""
+    def put(self, take: Callable[[Any], None], message: Any, size: int) -> None:
+        """Queue a message of some bytes for a method of the tracker."""
         self.newest = at = self._stopwatch.now()
-        self._queue.put(_Queued(what, message, at), size)
+        self._queue.put(_Queued(take, message, at), size)
         self._arrived.set()
 
-    def feed(self, tracker: Tracker, until: float) -> None:
+    def feed(self, until: float) -> None:
         """
         Pass the messages that arrived until a time to the tracker, which keeps a few.
 
         until: by the machine's clock (monotonic seconds).
         """
-        while self.feed_next(tracker, lambda at: at.machine <= until):
+        while self.feed_next(lambda at: at.machine <= until):
             pass
 
-    def feed_next(self, tracker: Tracker, wanted: Callable[[Moment], bool]) -> bool:
+    def feed_next(self, wanted: Callable[[Moment], bool]) -> bool:
         """Pass the oldest message to the tracker if its arrival is wanted; return whether."""
         waiting = self._queue.peek()
         if waiting is None or not wanted(waiting.at):
             return False
         if (one := self._queue.get(timeout=0)) is None:
             return False
-        getattr(tracker, one.what)(one.message)
+        one.take(one.message)
         return True
 
     def expect(self) -> None:

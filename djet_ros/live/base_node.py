@@ -122,8 +122,8 @@ class LiveNode:
             return f'its type is {", ".join(sorted(kinds))}, not {wanted}' + (
                 _transport_remedy(kinds))
         if offers:
-            return (f'{len(offers)} publisher{"s" if len(offers) > 1 else ""}, but no messages '
-                    f'arrive{self._loss_remedy(topic, offers)}')
+            return (f'no messages arrive from {" and ".join(sorted({one.who for one in offers}))}'
+                    + self._loss_remedy(topic, offers))
         if _IMAGE in (wanted, *kinds) and self._middleware.publishers_of(f'{topic}/compressed'):
             return (f'it has no publisher, but {topic}/compressed has; set '
                     'ros.image_transport:=compressed')
@@ -181,16 +181,18 @@ class LiveNode:
 
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
                profile: Profile, ready: Callable[[], bool] | None = None, *,
-               as_configured: bool = True) -> Subscription:
+               as_configured: bool = True, many: bool = False) -> Subscription:
         """
         Subscribe to a resolved topic; publishers with incompatible QoS are reported.
 
-        as_configured: whether the profile is that of ``input_profile``, which parameters set.
+        as_configured: whether the profile is that of ``input_profile``, which parameters set;
+        ready, many: see ``Middleware.listen``.
         """
         self._kinds[topic] = kind
         if as_configured:
             self._as_configured.add(topic)
-        self._inputs.append(self._middleware.listen(topic, kind, callback, profile, ready))
+        self._inputs.append(self._middleware.listen(topic, kind, callback, profile, ready,
+                                                    many=many))
         return self._inputs[-1]
 
     def listen_to_camera(self, image: str, info: str, transport: str, profile: Profile) -> None:

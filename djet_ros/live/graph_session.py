@@ -39,6 +39,7 @@ class GraphSession:
 
     def __init__(self, slam: LiveSlam, wiring: Wiring, topics: Mapping[str, str]) -> None:
         self._slam = slam
+        slam.node_values = self._node_values
         self._wiring = wiring
         self._topics = topics
         self._log = Throttle(wiring)
@@ -155,7 +156,6 @@ class GraphSession:
                 self._publish(self._slam.work())
                 self._log_loops()
                 continue
-            self._slam.node_values = self._node_values()
             self._publish(task.do())
             self._latencies.add(task.since)
             if self._slam.remark:

@@ -107,12 +107,14 @@ class Middleware(Protocol):
         """Create a publisher of a ROS type on a topic, by its resolved name."""
 
     def listen(self, topic: str, kind: str, callback: Callable[[Any], None],
-               profile: Profile, ready: Callable[[], bool] | None = None) -> Subscription:
+               profile: Profile, ready: Callable[[], bool] | None = None, *,
+               many: bool = False) -> Subscription:
         """
         Subscribe to a topic, by its resolved name.
 
         ready: called before each message; while it returns False, messages of this topic stay in
-        the middleware, and other topics continue. Used only if ``publishers_block``.
+        the middleware, and other topics continue. Used only if ``publishers_block``. many: whether
+        messages are so frequent that they are better taken together, some ms late.
         """
 
     def publishers_of(self, topic: str) -> Sequence[PublisherInfo]:

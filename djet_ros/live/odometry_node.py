@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 from djet_ros.config.sections import Config
 from djet_ros.live.base_node import input_profile, LiveNode
-from djet_ros.live.middleware import FRAMES_PROFILE, Middleware
+from djet_ros.live.middleware import FRAMES_PROFILE, Middleware, Profile
 from djet_ros.live.session import Session
 from djet_ros.live.topics import AUXILIARY_TYPES, odometry_outputs, SPEED_TYPES
 from djet_ros.odometry.moving_frames import TOPIC as TF
@@ -17,6 +19,8 @@ from djet_ros.recordings.mask_files import static_mask
 # History depths for the time in which Python does not get to run: of imu, guess and tf (seconds of
 # the fastest IMU), and of masks, which are as large and as frequent as images.
 _DEPTH, _MASKS_DEPTH = 2000, 100
+
+_INPUT_TYPES = {**AUXILIARY_TYPES, **SPEED_TYPES, TF: TF_TYPE, TF_STATIC: TF_TYPE}
 
 
 class OdometryNode(LiveNode):
@@ -35,8 +39,7 @@ class OdometryNode(LiveNode):
                     speed_topics=' or '.join(map(middleware.resolve, SPEED_TYPES)),
                     static_mask=static_mask(config.odometry.mask_file)), self,
             {'image': image, 'camera_info': info})
-        self._speed_subscribed = self._guess_tf_subscribed = False
-        self._auxiliary_topics: set[str] = set()
+        self._subscribed: set[str] = set()
         self.connect(config)
         self.update_tf_subscription()
         self.listen_to_camera(image, info, config.ros.image_transport, input_profile(config.ros))
@@ -52,24 +55,21 @@ class OdometryNode(LiveNode):
     def connect(self, config: Config) -> None:
         """Create the publishers and subscriptions of a configuration; may raise DjetError."""
         self.advertise(odometry_outputs(config.ros))
-        odometry = config.odometry
-        enabled = {'imu': odometry.imu, 'mask': odometry.mask,
-                   'guess': odometry.guess_by_topic}
-        for topic in enabled:
-            if enabled[topic] and topic not in self._auxiliary_topics:
-                self.listen(self._middleware.resolve(topic), AUXILIARY_TYPES[topic],
-                            getattr(self.session, topic),
-                            replace(input_profile(config.ros),
-                                    depth=_MASKS_DEPTH if topic == 'mask' else _DEPTH))
-                self._auxiliary_topics.add(topic)
-        if odometry.guess_by_tf and not self._guess_tf_subscribed:
-            self.listen(self._middleware.resolve(TF), TF_TYPE, self.session.tf,
-                        replace(input_profile(config.ros), depth=_DEPTH))
-            self.listen(self._middleware.resolve(TF_STATIC), TF_TYPE, self.session.tf_static,
-                        FRAMES_PROFILE, as_configured=False)
-            self._guess_tf_subscribed = True
-        if config.odometry.scale == 'speed' and not self._speed_subscribed:
-            for topic, kind in SPEED_TYPES.items():
-                self.listen(self._middleware.resolve(topic), kind, self.session.speed,
-                            input_profile(config.ros))
-            self._speed_subscribed = True
+        odometry, profile, session = config.odometry, input_profile(config.ros), self.session
+        deep, tf = replace(profile, depth=_DEPTH), odometry.guess_by_tf
+        self._listen_once(odometry.imu, 'imu', session.imu, deep, many=True)
+        self._listen_once(odometry.mask, 'mask', session.mask,
+                          replace(profile, depth=_MASKS_DEPTH))
+        self._listen_once(odometry.guess_by_topic, 'guess', session.guess, deep)
+        self._listen_once(tf, TF, session.tf, deep, many=True)
+        self._listen_once(tf, TF_STATIC, session.tf_static, FRAMES_PROFILE, as_configured=False)
+        for topic in SPEED_TYPES:
+            self._listen_once(odometry.scale == 'speed', topic, session.speed, profile)
+
+    def _listen_once(self, wanted: bool, topic: str, callback: Callable[[Any], None],
+                     profile: Profile, *, as_configured: bool = True, many: bool = False) -> None:
+        """Subscribe to an input if it is wanted and was not before; see ``listen``."""
+        if wanted and topic not in self._subscribed:
+            self.listen(self._middleware.resolve(topic), _INPUT_TYPES[topic], callback, profile,
+                        as_configured=as_configured, many=many)
+            self._subscribed.add(topic)

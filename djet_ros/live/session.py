@@ -6,7 +6,7 @@ It is independent of the middleware, which live nodes add.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from threading import Lock, Thread
 from time import monotonic, time_ns
@@ -70,6 +70,7 @@ class Session:
     def __init__(self, tracker: Tracker, wiring: Wiring, topics: Mapping[str, str]) -> None:
         node = tracker.config.ros
         self._tracker = tracker
+        tracker.node_values, tracker.node_complaints = self._node_values, self._node_complaints
         self._wiring = wiring
         self._topics = topics
         self._queue: FrameQueue[_Received] = FrameQueue(
@@ -141,30 +142,30 @@ class Session:
 
     def speed(self, message: Any) -> None:
         """Take a TwistStamped or an Odometry as the camera's speed."""
-        self._take('speed', message)
+        self._take(self._tracker.speed, message)
 
     def imu(self, message: Any) -> None:
         """Take an Imu."""
-        self._take('imu', message)
+        self._take(self._tracker.imu, message)
 
     def guess(self, message: Any) -> None:
         """Take an Odometry for the initial motion."""
-        self._take('guess', message)
+        self._take(self._tracker.guess, message)
 
     def tf(self, message: Any) -> None:
         """Take a TFMessage of /tf."""
-        self._take('tf', message)
+        self._take(self._tracker.tf, message)
 
     def tf_static(self, message: Any) -> None:
         """Take a TFMessage of /tf_static."""
-        self._take('tf_static', message)
+        self._take(self._tracker.tf_static, message)
 
     def mask(self, message: Any) -> None:
         """Take the mask of the image that has its stamp."""
-        self._take('mask', message)
+        self._take(self._tracker.mask, message)
 
-    def _take(self, what: str, message: Any) -> None:
-        self._auxiliary.put(what, message, _bytes(message))
+    def _take(self, by_tracker: Callable[[Any], None], message: Any) -> None:
+        self._auxiliary.put(by_tracker, message, _bytes(message))
 
     def count_lost(self, number: int) -> None:
         """Count images that were sent and did not arrive."""
@@ -248,7 +249,7 @@ class Session:
         try:
             silent = monotonic() - self._last_image > SILENCE_TIMEOUT
             if not len(self._queue):
-                self._auxiliary.feed(self._tracker, np.inf)
+                self._auxiliary.feed(np.inf)
             if silent:
                 # No image is queued that arrived before this CameraInfo.
                 self._take_info(self._newest_info)
@@ -285,9 +286,8 @@ class Session:
     def _process(self, received: _Received) -> None:
         tracker = self._tracker
         self._count_drops()
-        self._update_node_diagnostics()
         self._take_info(received.info)
-        self._auxiliary.feed(tracker, self._auxiliary_cutoff(received))
+        self._auxiliary.feed(self._auxiliary_cutoff(received))
         frame = frame_of(received.image.header)
         if not tracker.mounted:
             self._mount(frame)
@@ -315,10 +315,9 @@ class Session:
         while not self._stopping and received.at.machine > self._forgotten:
             inputs.expect()
             with self._lock:
-                inputs.feed(self._tracker, self._auxiliary_cutoff(received))
+                inputs.feed(self._auxiliary_cutoff(received))
                 while (lacking := self._tracker.needs(received.image)) and inputs.feed_next(
-                        self._tracker, lambda at: elapsed(
-                            received.at, at) <= _MAX_AUXILIARY_TIMEOUT):
+                        lambda at: elapsed(received.at, at) <= _MAX_AUXILIARY_TIMEOUT):
                     pass
             newest = inputs.newest
             since = received.at if newest is None or not patient else max(received.at, newest)
@@ -372,15 +371,12 @@ class Session:
             self._publish(self._tracker.camera_info(info))
             self._log_problem()
 
-    def _update_node_diagnostics(self) -> None:
-        self._tracker.node_values = self._node_values()
+    def _node_complaints(self) -> list[Complaint]:
         waiting = self._queue.weight
         # Warn before anything is lost.
-        self._tracker.node_complaints = [] if waiting < MAX_QUEUE_BYTES / 2 else [Complaint(
-            'images pile up', 'WARN', (
-                f'{waiting * 1e-6:.0f} MB of images are queued; from '
-                f'{MAX_QUEUE_BYTES * 1e-6:.0f} MB on images are dropped, unless their publisher '
-                f'can wait; {REDUCE_LOAD}'))]
+        return [] if waiting < MAX_QUEUE_BYTES / 2 else [Complaint('images pile up', 'WARN', (
+            f'{waiting * 1e-6:.0f} MB of images are queued; from {MAX_QUEUE_BYTES * 1e-6:.0f} MB '
+            f'on images are dropped, unless their publisher can wait; {REDUCE_LOAD}'))]
 
     def _node_values(self) -> dict[str, str]:
         return {'frames lost on the way': str(self._lost),
@@ -396,7 +392,6 @@ class Session:
         self._wiring.publish(outgoing)
 
     def _publish_diagnostics(self) -> None:
-        self._update_node_diagnostics()
         self._publish([self._tracker.diagnostics(time_ns())])
 
     def _log_problem(self) -> None:

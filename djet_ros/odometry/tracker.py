@@ -7,6 +7,7 @@ same order give the same poses everywhere.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import math
 from typing import Any, NamedTuple
 
@@ -76,9 +77,9 @@ class Tracker:
                  speed_topics: str = 'speed or speed_odometry', node: str = NODE_NAME,
                  static_mask: NDArray[np.bool_] | None = None) -> None:
         self.config = config
-        # What a front end adds to each diagnostics message, such as its latency.
-        self.node_values: dict[str, str] = {}
-        self.node_complaints: list[Complaint] = []
+        # What a front end adds to each diagnostics message, as its latency, and to complaints.
+        self.node_values: Callable[[], dict[str, str]] = dict
+        self.node_complaints: Callable[[], list[Complaint]] = list
         self._message_type = message_type
         self._image_topic = image_topic
         self._speed_topics = speed_topics
@@ -341,7 +342,7 @@ class Tracker:
         more = self._of_camera
         return [*self._health.complaints(self._scale, self.mounted),
                 *(one for one in more if one is not None),
-                *self.complaints_of_inputs, *self.node_complaints]
+                *self.complaints_of_inputs, *self.node_complaints()]
 
     @property
     def _of_camera(self) -> tuple[Complaint | None, ...]:
@@ -378,7 +379,7 @@ class Tracker:
         if (found := self._odometry.calibration) is not None:
             diagnosis.values['calibration off by'] = deviation_text(found)
         diagnosis.values.update(self._inputs.values())
-        diagnosis.values.update(self.node_values)
+        diagnosis.values.update(self.node_values())
         return diagnosis
 
     def diagnostics(self, stamp: int) -> Outgoing:

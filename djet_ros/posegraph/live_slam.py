@@ -7,6 +7,7 @@ Its motions come from the odometry, its loops from the images of keyframes.
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -54,8 +55,8 @@ class LiveSlam:
                  node: str = 'pose_graph_node',
                  static_mask: NDArray[np.bool_] | None = None) -> None:
         self.config, self.slam = config, config.slam
-        # Values that the live node adds to each diagnostics message.
-        self.node_values: dict[str, str] = {}
+        # Returns values that the live node adds to each diagnostics message.
+        self.node_values: Callable[[], dict[str, str]] = dict
         # Why the newest message discarded the map, for the log.
         self.remark = ''
         self._messages = MessageFactory(message_type)
@@ -233,7 +234,7 @@ class LiveSlam:
             'relative poses missing': str(self._steps.missing),
             **{f'messages rejected: {topic}': str(count)
                for topic, count in sorted(self.rejected.items())},
-            **self.node_values}
+            **self.node_values()}
         return Outgoing('/diagnostics', self._messages.diagnostics(
             stamp, f'{self._node}: pose graph', level,
             f'{summary}: {self.problem}' if self.problem else summary, values,
