@@ -202,18 +202,22 @@ def test_a_drive_without_significant_distortion_has_no_corrected_replays(small_k
 
 
 def test_the_page_compares_the_estimated_distortion_with_others():
-    def one(off: float) -> dict[str, dict[str, float]]:
-        return {'positions': {'rmse_m': off, 'scale_change': 1.0},
-                'drift': {'translation_percent': 0.5, 'rotation_deg_per_100m': 0.25}}
-    part = {'frames': 9, 'length': 5.0, 'chained': [], 'replays': {'images alone': one(2.5)},
-            'lens': {'k1': 0.02, 'sigma': 0.005, 'replays': {'images alone': one(0.5)},
-                     'beside': {'-2': one(1.5), '1': one(0.75)}}}
+    def some(off: float) -> list[dict[str, dict[str, float]]]:
+        return [{'positions': {'rmse_m': value, 'scale_change': 1 + sign * value},
+                 'drift': {'translation_percent': 0.5, 'rotation_deg_per_100m': 0.25}}
+                for value, sign in ((off, 1), (off / 2, -1), (2 * off, -1))]
+    part = {'frames': 9, 'length': 5.0, 'chained': [], 'replays': {'images alone': some(0.4)},
+            'lens': {'k1': 0.02, 'sigma': 0.005, 'replays': {'images alone': some(0.1)},
+                     'beside': {'-2': some(0.3), '1': some(0.2)}}}
     results = {'parts': {'drive kitti 07': part}}
-    figures = '1.000 | 0.50 | 0.250 |'
-    rows = [line for line in script('pages').lens(results).splitlines() if figures in line]
-    assert rows == [f'| {k1} | {off} | {figures}' for k1, off in (
-        ('0.0000', '2.50'), ('0.0100', '1.50'), ('0.0200', '0.50'), ('0.0250', '0.75'))]
-    assert f'| KITTI 07, images alone, distortion corrected | 0.50 | {figures}' in script(
+    # Medians, and the worst: the scale farthest from one.
+    figures = {0.4: '0.40 (0.80) | 0.800 (0.200)', 0.3: '0.30 (0.60) | 0.850 (0.400)',
+               0.1: '0.10 (0.20) | 0.950 (0.800)', 0.2: '0.20 (0.40) | 0.900 (0.600)'}
+    drift = ' | 0.50 (0.50) | 0.250 (0.250) |'
+    rows = [line for line in script('pages').lens(results).splitlines() if drift in line]
+    assert rows == [f'| {k1} | {figures[off]}{drift}' for k1, off in (
+        ('0.0000', 0.4), ('0.0100', 0.3), ('0.0200', 0.1), ('0.0250', 0.2))]
+    assert f'| KITTI 07, images alone, distortion corrected | {figures[0.1]}{drift}' in script(
         'pages').drift(results)
 
 

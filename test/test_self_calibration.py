@@ -163,6 +163,10 @@ def test_noise_is_not_taken_for_a_wrong_calibration() -> None:
             assert not found.needs_update
 
 
+# Image at which the first of the rendered turns begins.
+FIRST_TURN = 13
+
+
 @cache
 def rendered_turn(frames: int = 75) -> tuple[Scene, Numbers, list[NDArray[np.uint8]]]:
     """Return a turn, its poses and its images, of which all lenses are made."""
@@ -230,7 +234,7 @@ def test_what_is_wrong_is_estimated_in_a_turn_and_reported(
     apart = np.array([np.abs(one.motion[:3, :3] - other.motion[:3, :3]).max()
                       for one, other in zip(results, unknowing)])
     first = int(np.flatnonzero(apart)[0])
-    assert 30 < first < 60
+    assert FIRST_TURN < first < 60
     with_it, without = (bent.off(some)[first:] for some in (results, unknowing))
     gained = without - with_it
     assert gained.mean() > 2 * gained.std() / np.sqrt(len(gained))
@@ -242,7 +246,7 @@ def test_the_back_end_gets_the_correction_of_each_image(
     """Loops are the same live, by messages, and later, by results."""
     _, results = tracked_bent
     corrections = [one.camera_correction for one in results]
-    assert not any(map(any, corrections[:30]))
+    assert not any(map(any, corrections[:FIRST_TURN]))
     # The significant part of it.
     assert 0 < corrections[-1].k1 < 0.018
     make, estimate, live = Messages(message_type, OdometryConfig()), StepMessages('body'), []

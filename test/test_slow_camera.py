@@ -89,12 +89,13 @@ def test_along_a_desk_a_rotation_does_not_absorb_a_centimetre() -> None:
     """
     It moves all points by as much, but for half a pixel: too little for a direction.
 
-    The pair's rotation is that of its pose; landmarks tell how far the camera went.
+    The pair's rotation is that of its pose, not the 0.3 degrees of a rotation alone; landmarks
+    tell how far the camera went.
     """
     steps = list(seen_slowly('handheld', 1, 1, range(6)))
     unit = np.linalg.norm(steps[1][1][:3, 3])
     result, motion, _ = steps[5]
     assert result.status is Status.NO_PARALLAX
-    assert np.degrees(rotation_angle(result.motion[:3, :3], motion[:3, :3])) < 0.02
+    assert np.degrees(rotation_angle(result.motion[:3, :3], motion[:3, :3])) < 0.03
     before, after = (result.pose for result, _, _ in steps[4:])
     assert np.linalg.inv(before)[:3] @ after[:, 3] == pytest.approx(motion[:3, 3] / unit, abs=0.05)
