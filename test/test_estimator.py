@@ -15,6 +15,7 @@ import cv2
 from djet_ros.core.covariance import CHI2_999, pose_difference, squared_distance
 from djet_ros.core.estimator import TwoViewEstimator
 from djet_ros.core.estimator_config import EstimatorConfig, METHODS, preset
+from djet_ros.core.fusion import MeasuredRotation
 from djet_ros.core.geometry import (
     direction_angle,
     epipolar_lines,
@@ -558,6 +559,24 @@ def test_steps_of_nine_metres_through_leaves_are_found_among_mostly_false_matche
         assert result.inliers.mean() < 0.25
         assert np.degrees(rotation_angle(result.R, true_motion[:3, :3])) < 0.2
         assert np.degrees(direction_angle(result.t, true_motion[:3, 3])) < 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('seed, first, second', [(0, 28, 32), (1, 6, 12)])
+def test_behind_a_lorry_a_gyro_tells_which_motion_is_the_camera_s(
+        seed: int, first: int, second: int) -> None:
+    """So much later more matches move with the lorry than with the road."""
+    scene, estimator = make_scene('motorway', seed), TwoViewEstimator()
+    poses = list(scene.trajectory(second + 1))
+    views = [estimator.view(scene.render(poses[i], i), scene.K) for i in (first, second)]
+    true_motion = np.linalg.inv(poses[second]) @ poses[first]
+    turn = MeasuredRotation(true_motion[:3, :3], np.radians(0.05)**2 * np.eye(3))
+    for known, right in ((KnownMotion(turn), True), (KnownMotion(), False)):
+        result = estimator.estimate(*views, known=known)
+        off = (np.degrees(rotation_angle(result.R, true_motion[:3, :3])),
+               np.degrees(direction_angle(result.t, true_motion[:3, 3])))
+        assert bool(off[0] < 0.2 and off[1] < 2) is right
+        assert not right or result.status is Status.OK
 
 
 # Real frames.
