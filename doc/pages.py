@@ -379,7 +379,8 @@ def lens(results: Any) -> str:
         runs = {0.0: part['replays'][ALONE], k1: found['replays'][ALONE],
                 **{k1 + int(off) * sigma: one for off, one in found['beside'].items()}}
         text += (paragraph(f"{known_as(name.removeprefix('drive '))}, {part['frames']} frames, "
-                           f'{ALONE}; `djet lens` finds k1 = {k1:.4f} ± {sigma:.4f}:')
+                           f'{ALONE}, medians (worst) of replays from the first five frames; '
+                           f'`djet lens` finds k1 = {k1:.4f} ± {sigma:.4f}:')
                  + table(('k1', *OF_REPLAY), ((f'{value:.4f}', *replay(runs[value]))
                                               for value in sorted(runs))))
     return text or 'No drive shows a distortion that is worth correcting.\n'
