@@ -363,8 +363,7 @@ def drift(results: Any) -> str:
                       'ground truth:')
             + table(('', 'method', 't_rel, %', 'r_rel, ° per 100 m'), chained) + '\n'
             + paragraph('`djet replay`, with its own translation lengths. ATE after alignment, '
-                        'with scale unless it is metric. Medians (worst) of replays that begin at '
-                        'the first frame, the second, and so on to the fifth:')
+                        f'with scale unless it is metric. {medians(drives[0][1])}:')
             + table(('', *OF_REPLAY), replays))
 
 
@@ -379,11 +378,17 @@ def lens(results: Any) -> str:
         runs = {0.0: part['replays'][ALONE], k1: found['replays'][ALONE],
                 **{k1 + int(off) * sigma: one for off, one in found['beside'].items()}}
         text += (paragraph(f"{known_as(name.removeprefix('drive '))}, {part['frames']} frames, "
-                           f'{ALONE}, medians (worst) of replays from the first five frames; '
-                           f'`djet lens` finds k1 = {k1:.4f} ± {sigma:.4f}:')
+                           f'{ALONE}; `djet lens` finds k1 = {k1:.4f} ± {sigma:.4f}. '
+                           f'{medians(part)}:')
                  + table(('k1', *OF_REPLAY), ((f'{value:.4f}', *replay(runs[value]))
                                               for value in sorted(runs))))
     return text or 'No drive shows a distortion that is worth correcting.\n'
+
+
+def medians(part: Any) -> str:
+    """Return what the figures of a drive's replays are."""
+    count = max(map(len, part['replays'].values()), default=0)
+    return f'Medians (worst) of {count} replays, which begin at the first {count} frames'
 
 
 def replay(ones: Any) -> tuple[str, ...]:

@@ -17,7 +17,6 @@ from djet_ros.core.geometry import (
     line_distances,
     norms,
     patch_warp,
-    quaternion,
     rays,
     rotation_angle,
     rotation_exp,
@@ -30,6 +29,7 @@ from djet_ros.core.geometry import (
     turn_before_plane,
     unit,
 )
+from djet_ros.recordings.trajectories import position_and_quaternion
 from hypothesis import example, given, strategies as st
 from hypothesis.extra.numpy import arrays
 import numpy as np
@@ -76,7 +76,9 @@ def test_vectorised_functions_agree_with_single_calls():
 @example(np.array([0.0, 0.0, 1.0]), 0.0)
 def test_a_quaternion_makes_its_rotation_again(axis, angle):
     R = Rotation.from_rotvec(angle * axis).as_matrix()
-    found = quaternion(R)
+    pose = np.eye(4)
+    pose[:3, :3] = R
+    found = position_and_quaternion(pose)[3:]
     assert found[3] >= 0 and norms(np.array(found)) == pytest.approx(1, abs=1e-15)
     assert Rotation.from_quat(found).as_matrix() == pytest.approx(R, abs=1e-15)
 

@@ -9,7 +9,6 @@ Tracking").
 from __future__ import annotations
 
 from functools import lru_cache
-import math
 from typing import Any
 
 import cv2
@@ -58,17 +57,6 @@ def rotation_log(R: Array) -> Array:
     sines = norms(antisymmetric)
     angles = np.arctan2(sines, cosines)
     return np.asarray(antisymmetric * (angles / np.maximum(sines, 1e-300))[..., None])
-
-
-def quaternion(R: Array) -> list[float]:
-    """Return (x, y, z, w) with w >= 0 of a rotation matrix (3, 3), in a tenth of SciPy's time."""
-    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
-    # The rows of 4 q q^T. That of the largest component is the most accurate.
-    rows = ((1 + a - e - i, b + d, c + g, h - f), (b + d, 1 - a + e - i, f + h, c - g),
-            (c + g, f + h, 1 - a - e + i, d - b), (h - f, c - g, d - b, 1 + a + e + i))
-    row = rows[max(range(4), key=lambda k: rows[k][k])]
-    scale = (1.0 if row[3] >= 0 else -1.0) / math.hypot(*row)
-    return [scale * component for component in row]
 
 
 def unit(v: Array) -> Array:

@@ -15,6 +15,7 @@ from djet_ros.core.correction import AS_CALIBRATED, Correction, OF_CAMERA
 from djet_ros.core.geometry import rays
 from djet_ros.core.types import Array
 import numpy as np
+from scipy.special import softmax
 
 # chosen: prior standard deviation of the distortion, as displacement of the farthest corner
 # relative to its distance from the principal point; and those of the focal length and of the
@@ -100,8 +101,7 @@ class SelfCalibration:
         squared = (mean * np.linalg.solve(blocks, mean[:, :, None])[:, :, 0]).sum(1)
         logs = (_SUBSETS.sum(1) * np.log(_PRIOR_ODDS)
                 - (np.linalg.slogdet(blocks)[1] + squared) / 2)
-        odds = np.exp(logs - logs.max())
-        return float(odds[-1] / odds.sum())
+        return float(softmax(logs)[-1])
 
     @property
     def significant(self) -> bool:

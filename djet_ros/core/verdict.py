@@ -263,8 +263,10 @@ def _covariance(track: Track, pose: Pose, x: Array, flipped: bool, near_noise: b
     residuals = epipolar_residuals(problem, pose.R, pose.t) if flipped else track.residuals
     hessian = loss_hessian(problem, pose, residuals, loss) if near_noise else None
     curved = curvature_at(residuals, loss, hessian)
+    if curved is None:
+        return UNDETERMINED[0]
     covariance, _ = pose_covariance(residuals, loss, voting, pose.t, False, curved)
-    if curved is None or not np.isfinite(covariance).all():
+    if not np.isfinite(covariance).all():
         return covariance
     return widened_by_profile(covariance, problem, pose, loss, residuals, curved)
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from djet_ros.config.sections import NODE_NAME, OdometryConfig
 from djet_ros.core.correction import AS_CALIBRATED, Correction
-from djet_ros.core.geometry import quaternion, rotation_log
+from djet_ros.core.geometry import rotation_log
 from djet_ros.core.types import Array, STARTED, Status, TRACKED
 from djet_ros.errors import DjetError
 from djet_ros.odometry.mounting import pose_of_base, twist_of_base
@@ -87,13 +87,13 @@ def pose_of(message: Any) -> tuple[int, Array]:
     else:
         pose = message.pose.pose if hasattr(message.pose, 'pose') else message.pose
         position, orientation = pose.position, pose.orientation
-    turn = np.array([orientation.x, orientation.y, orientation.z, orientation.w])
+    quaternion = np.array([orientation.x, orientation.y, orientation.z, orientation.w])
     result = np.full((4, 4), np.nan)
     place = np.abs([position.x, position.y, position.z])
-    if (place <= FARTHEST).all() and (np.abs(turn) < 2.0).all() \
-            and 0.5 < np.linalg.norm(turn) < 2.0:
+    if (place <= FARTHEST).all() and (np.abs(quaternion) < 2.0).all() \
+            and 0.5 < np.linalg.norm(quaternion) < 2.0:
         result[:] = np.eye(4)
-        result[:3, :3] = Rotation.from_quat(turn).as_matrix()
+        result[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
         result[:3, 3] = position.x, position.y, position.z
     return stamp_ns(message.header), result
 
@@ -243,7 +243,7 @@ class MessageFactory:
             header=self.header(stamp, frame_id), status=[status])
 
     def _pose(self, pose: Array) -> Any:
-        x, y, z, w = quaternion(pose[:3, :3])
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True).tolist()
         position = _plain(pose[:3, 3])
         return self._type('geometry_msgs/msg/Pose')(
             position=self._type('geometry_msgs/msg/Point')(

@@ -12,7 +12,6 @@ from abc import abstractmethod
 from collections.abc import Iterable
 from pathlib import Path
 
-from djet_ros.core.geometry import quaternion
 from djet_ros.core.types import Array
 from djet_ros.errors import DjetError
 from djet_ros.odometry.messages import seconds_text
@@ -94,7 +93,8 @@ def poses_from_quaternions(positions: Array, quaternions: Array, path: Path) -> 
 
 def position_and_quaternion(pose: Array) -> tuple[float, ...]:
     """Return (x, y, z, qx, qy, qz, qw), with qw >= 0, of a pose (4, 4)."""
-    return (*pose[:3, 3].tolist(), *quaternion(pose[:3, :3]))
+    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
+    return (*pose[:3, 3].tolist(), *quaternion.tolist())
 
 
 def digits(values: Iterable[float]) -> str:
